@@ -1,0 +1,1 @@
+"""The configuration tree: one YAML per choice, shipped with the package."""

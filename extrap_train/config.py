@@ -1,0 +1,214 @@
+"""The configuration tree as plain dataclasses: every option, its type, its unit and its bounds.
+
+Light on purpose (no torch), so that `--help` is instant. YAMLs under `conf/` choose among the variants of a group;
+this file says what may stand in them.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+MISSING: Any = "???"  # OmegaConf's mark for "must be given"
+
+CATEGORIES = ("apple", "book", "chair", "cup", "hydrant", "teddybear")
+
+
+@dataclass
+class CategoryConfig:
+    """What the model is trained on: one category, or several for a base model."""
+
+    name: str = MISSING
+    members: list[str] = field(default_factory=list)
+    """CO3D's names of the categories; one, but for `all`."""
+
+
+@dataclass
+class DataConfig:
+    """Where sequences come from; one subclass a source."""
+
+    name: str = MISSING
+    root: str | None = None
+    """Folder of the data set; made where the source makes its own."""
+
+
+@dataclass
+class SyntheticConfig(DataConfig):
+    """Rendered sequences in CO3D's layout, the same on every machine."""
+
+    name: str = "synthetic"
+    test_sequences: int = 5
+    """Sequences 0 … n−1 are for testing, whatever else is asked for."""
+    train_sequences: int = 40
+    frames: int = 24
+    """Photographs around each scene."""
+    image_size: int = 128
+    """Pixels of the square photographs."""
+    seed: int = 0
+
+
+@dataclass
+class Co3dConfig(DataConfig):
+    """A CO3D v1 or v2 download."""
+
+    name: str = "co3d"
+    root: str | None = MISSING
+    test_sequences: int = 5
+    """Held out, drawn by a hash of the sequence's name; a lone sequence holds out frames instead."""
+
+
+@dataclass
+class DepthConfig:
+    """Where depth comes from; one subclass a source."""
+
+    name: str = MISSING
+
+
+@dataclass
+class DatasetDepthConfig(DepthConfig):
+    """The depth that the data set brings."""
+
+    name: str = "dataset"
+
+
+@dataclass
+class StereoConfig(DepthConfig):
+    """Plane-sweep multi-view stereo for known poses."""
+
+    name: str = "stereo"
+    planes: int = 96
+    """Depth hypotheses, evenly spaced in inverse depth."""
+    neighbours: int = 4
+    """Other views that vote."""
+    image_size: int = 256
+    """Longer side that depth is estimated at, in pixels."""
+
+
+@dataclass
+class PrepConfig:
+    """Which sequences and pairs become training data (paper III-A.1)."""
+
+    image_size: int = 64
+    """Side of the stored square frames, in pixels: the model's resolution."""
+    max_gap_deg: float = 30.0
+    """Largest azimuth gap between neighbouring cameras of a 360° sequence."""
+    min_coverage_deg: float = 300.0
+    """Least azimuth covered around the fitted orbit axis."""
+    min_viewpoint_quality: float = 0.0
+    min_point_cloud_quality: float = -2.0
+    max_uses: int = 12
+    """Most pairs that one frame takes part in."""
+    min_pair_angle_deg: float = 8.0
+    max_pair_angle_deg: float = 88.0
+    near_duplicate_deg: float = 4.0
+    """A pair is skipped if a chosen one has both its frames within this angle of its own."""
+    full_circle_only: bool = True
+
+
+@dataclass
+class UNetConfig:
+    """Shape of the denoiser (diffusers' `UNet2DConditionModel`)."""
+
+    channels: list[int] = field(default_factory=lambda: [96, 192, 288])
+    layers_per_block: int = 1
+    attention_levels: list[bool] = field(default_factory=lambda: [False, False, True])
+    heads: int = 4
+    token_width: int = 256
+    """Width of the one cross-attention token."""
+
+
+@dataclass
+class ModelConfig:
+    """A denoiser with its conditioning (METHOD: paper II-B)."""
+
+    name: str = MISSING
+    image_size: int = 64
+    patch: int = 2
+    """Pixels a side that become channels of one latent: the small model's stand-in for a VAE."""
+    octaves: int = 4
+    """Of the positional encoding: 4 channels each."""
+    residual: bool = True
+    """Denoise the difference to the hole-filled warp instead of the image itself."""
+    prediction: str = "v_prediction"
+    """`epsilon`, `v_prediction` or `sample`."""
+    zero_terminal_snr: bool = True
+    unet: UNetConfig = field(default_factory=UNetConfig)
+    learning_rate: float = 3e-4
+    weight_decay: float = 0.01
+    start: str | None = None
+    """Folder of the model that training starts from; `base` is the one in the package; null is random."""
+
+
+@dataclass
+class SamplerConfig:
+    """How a view is sampled (DDIM)."""
+
+    steps: int = 20
+    eta: float = 0.0
+    guidance: float = 1.0
+    """Weight of the conditional prediction against the null condition's; 1 is no guidance."""
+
+
+@dataclass
+class TrainerConfig:
+    """How long, how often, on what."""
+
+    steps: int = 3000
+    batch_size: int = 16
+    warmup_steps: int = 100
+    condition_dropout: float = 0.1
+    """Share of the training examples whose condition is the null condition."""
+    ema_decay: float = 0.999
+    precision: str = "bf16-mixed"
+    accelerator: str = "auto"
+    devices: int = 1
+    checkpoint_every: int = 200
+    """Steps; a killed run loses at most this many."""
+    validate_every: int = 1000
+    workers: int = 0
+    """Processes that load batches beside the training process."""
+
+
+@dataclass
+class ValidationConfig:
+    """What the trained model is measured on: held-out sequences."""
+
+    examples: int = 60
+    batch_size: int = 20
+    pictures: int = 8
+    lpips_weights: str | None = None
+    """A full `lpips.LPIPS(net="squeeze")` state dict; null takes torchvision's cached backbone."""
+
+
+@dataclass
+class TrainConfig:
+    """The whole tree of `python -m extrap_train`."""
+
+    category: CategoryConfig = MISSING
+    data: DataConfig = MISSING
+    depth: DepthConfig = MISSING
+    model: ModelConfig = MISSING
+    prep: PrepConfig = field(default_factory=PrepConfig)
+    sampler: SamplerConfig = field(default_factory=SamplerConfig)
+    trainer: TrainerConfig = field(default_factory=TrainerConfig)
+    validation: ValidationConfig = field(default_factory=ValidationConfig)
+    task: str = "category"
+    seed: int = 0
+    run: str | None = None
+    """Name of the run's folder; by default made from the configuration, so that the same command resumes."""
+    resume: bool = True
+    output: str = "outputs"
+    threads: int | None = None
+    """CPU threads; null takes every core."""
+
+
+@dataclass
+class DataPrepConfig:
+    """The whole tree of `python -m data_prep`."""
+
+    category: CategoryConfig = MISSING
+    data: DataConfig = MISSING
+    depth: DepthConfig = MISSING
+    prep: PrepConfig = field(default_factory=PrepConfig)
+    seed: int = 0
+    output: str = "outputs"
+    workers: int | None = None
+    """Processes; null takes every core."""

@@ -1,0 +1,34 @@
+"""Captures on disk: a sequence of posed frames, read lazily, whatever the format they came in."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from extrap_train.views import Camera, View
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One posed photograph that has not been read yet."""
+
+    name: str
+    """Unique within its sequence; the image's file name."""
+    camera: Camera
+    """At the resolution of the image on disk."""
+    has_depth: bool
+    has_mask: bool
+    load: Callable[[], View]
+    """Reads image, depth and mask at full resolution; raises InputError that names the file."""
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """A capture of one scene."""
+
+    category: str
+    name: str
+    frames: tuple[Frame, ...]
+    viewpoint_quality: float | None = None
+    """CO3D's score of its camera poses; None where the capture has none."""
+    point_cloud_quality: float | None = None
+    point_cloud: Path | None = None

@@ -1,0 +1,184 @@
+"""The nouns that travel: cameras, views, and what a batch is made of. Conventions: `extrap_train.geometry`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One pinhole camera, or a batch of them that share an image size."""
+
+    world_to_cam: Float[Tensor, "*b 4 4"]
+    intrinsics: Float[Tensor, "*b 3 3"]
+    height: int
+    width: int
+
+    @property
+    def cam_to_world(self) -> Float[Tensor, "*b 4 4"]:
+        """The inverse of `world_to_cam`, exact for rigid transforms."""
+        rotation = self.world_to_cam[..., :3, :3].mT
+        inverse = self.world_to_cam.clone()
+        inverse[..., :3, :3] = rotation
+        inverse[..., :3, 3:] = -rotation @ self.world_to_cam[..., :3, 3:]
+        return inverse
+
+    @property
+    def center(self) -> Float[Tensor, "*b 3"]:
+        """The camera's position in the world."""
+        return self.cam_to_world[..., :3, 3]
+
+    @property
+    def forward(self) -> Float[Tensor, "*b 3"]:
+        """The viewing direction in the world, unit length."""
+        return self.world_to_cam[..., 2, :3]
+
+    def cropped(self, top: int, left: int, height: int, width: int) -> Self:
+        """The camera of the image's crop; the window may reach beyond the image."""
+        shift = torch.zeros_like(self.intrinsics)
+        shift[..., 0, 2], shift[..., 1, 2] = left, top
+        return replace(self, intrinsics=self.intrinsics - shift, height=height, width=width)
+
+    def resized(self, height: int, width: int) -> Self:
+        """The camera of the image resampled to `height` × `width`."""
+        rows = self.intrinsics.new_tensor([width / self.width, height / self.height, 1.0])
+        return replace(self, intrinsics=self.intrinsics * rows[:, None], height=height, width=width)
+
+    def to(self, device: torch.device | str) -> Self:
+        """The same camera on another device."""
+        return replace(
+            self, world_to_cam=self.world_to_cam.to(device), intrinsics=self.intrinsics.to(device)
+        )
+
+    def __getitem__(self, index: int | slice | tuple[int | slice, ...] | Tensor) -> Self:
+        """Index the leading dimensions."""
+        return replace(
+            self, world_to_cam=self.world_to_cam[index], intrinsics=self.intrinsics[index]
+        )
+
+
+def stack_cameras(cameras: Sequence[Camera]) -> Camera:
+    """One batched camera from several of the same image size (and the same leading dimensions)."""
+    sizes = {(camera.height, camera.width) for camera in cameras}
+    if len(sizes) != 1:
+        raise ValueError(f"cameras of different image sizes cannot be stacked: {sorted(sizes)}")
+    return replace(
+        cameras[0],
+        world_to_cam=torch.stack([camera.world_to_cam for camera in cameras]),
+        intrinsics=torch.stack([camera.intrinsics for camera in cameras]),
+    )
+
+
+@dataclass(frozen=True)
+class View:
+    """A posed photograph, with its depth and object mask where they are known."""
+
+    image: Float[Tensor, "3 h w"]
+    camera: Camera
+    depth: Float[Tensor, "h w"] | None = None
+    mask: Float[Tensor, "h w"] | None = None
+    name: str = ""
+
+    def cropped(self, top: int, left: int, height: int, width: int) -> Self:
+        """The view's crop; the window must lie inside the image."""
+        inside = 0 <= top and 0 <= left
+        if not (inside and top + height <= self.camera.height and left + width <= self.camera.width):
+            raise ValueError(
+                f"crop {height}×{width} at ({top}, {left}) leaves the "
+                f"{self.camera.height}×{self.camera.width} image"
+            )
+        window = (..., slice(top, top + height), slice(left, left + width))
+        return replace(
+            self,
+            image=self.image[window],
+            camera=self.camera.cropped(top, left, height, width),
+            depth=None if self.depth is None else self.depth[window],
+            mask=None if self.mask is None else self.mask[window],
+        )
+
+    def resized(self, height: int, width: int) -> Self:
+        """The view resampled: colours and mask by area, depth by nearest pixel (edges stay edges)."""
+        size = (height, width)
+        return replace(
+            self,
+            image=_resample_area(self.image, size).clamp(0, 1),
+            camera=self.camera.resized(height, width),
+            depth=None if self.depth is None else _resample_nearest(self.depth[None], size)[0],
+            mask=None if self.mask is None else _resample_area(self.mask[None], size)[0].clamp(0, 1),
+        )
+
+    def squared(self, size: int) -> Self:
+        """The largest centred square of the view, resampled to `size` × `size`."""
+        side = min(self.camera.height, self.camera.width)
+        top, left = (self.camera.height - side) // 2, (self.camera.width - side) // 2
+        return self.cropped(top, left, side, side).resized(size, size)
+
+
+def _resample_area(
+    image: Float[Tensor, "c h w"], size: tuple[int, int]
+) -> Float[Tensor, "c h2 w2"]:
+    return functional.interpolate(
+        image[None], size, mode="bilinear", antialias=True, align_corners=False
+    )[0]
+
+
+def _resample_nearest(
+    image: Float[Tensor, "c h w"], size: tuple[int, int]
+) -> Float[Tensor, "c h2 w2"]:
+    return functional.interpolate(image[None], size, mode="nearest-exact")[0]
+
+
+@dataclass(frozen=True)
+class ViewPair:
+    """What a training example is drawn from: frames of one sequence, references nearest first."""
+
+    sequence: str
+    query: int
+    references: tuple[int, ...]
+    score: float
+
+
+@dataclass(frozen=True)
+class Warp:
+    """What the references show of the query view (paper II-A). Zero, never by accident, where `mask` is 0."""
+
+    image: Float[Tensor, "b 3 h w"]
+    coordinates: Float[Tensor, "b 2 h w"]
+    """Normalised (u, v) in the nearest reference, valid where `nearest_mask` is 1."""
+    depth: Float[Tensor, "b h w"]
+    weight: Float[Tensor, "b h w"]
+    """Summed bilinear coverage; small at the rim of a hole."""
+    mask: Float[Tensor, "b h w"]
+    """1 where any reference reaches the pixel, else 0."""
+    nearest_mask: Float[Tensor, "b h w"]
+    """1 where the nearest reference, the one with index 0, reaches the pixel."""
+
+
+@dataclass(frozen=True)
+class PairBatch:
+    """A batch of examples: target view, up to `k` references (nearest first), and the warp between them."""
+
+    image: Float[Tensor, "b 3 h w"]
+    camera: Camera
+    reference_images: Float[Tensor, "b k 3 h w"]
+    reference_cameras: Camera
+    reference_depths: Float[Tensor, "b k h w"]
+    reference_valid: Bool[Tensor, "b k"]
+    """False for a place without a reference: every example has at least one, the first."""
+    warp: Warp | None = None
+    """Made from the references when the batch is made; None before."""
+
+    def to(self, device: torch.device | str) -> Self:
+        """The same batch on another device."""
+        moved = {
+            name: value.to(device)
+            for name, value in vars(self).items()
+            if isinstance(value, Tensor | Camera)
+        }
+        warp = self.warp and Warp(**{name: x.to(device) for name, x in vars(self.warp).items()})
+        return replace(self, **moved, warp=warp)
