@@ -1,0 +1,134 @@
+"""CO3D's annotation entries (v1 and v2) as typed records, their JSON checked."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from extrap_train.data.files import check_relative, read_json
+from extrap_train.data.validation import require_list
+from extrap_train.errors import InputError
+from extrap_train.geometry.pytorch3d import NDC_FORMATS
+
+
+@dataclass(frozen=True, slots=True)
+class DepthFiles:
+    """A depth map (float16 in a 16-bit PNG) and which of its pixels to trust."""
+
+    path: str
+    scale: float
+    mask_path: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class FrameAnnotation:
+    """One frame; paths are relative to the data set's root."""
+
+    sequence: str
+    number: int
+    image_path: str
+    size: tuple[int, int]
+    """(height, width) in pixels."""
+    depth: DepthFiles | None
+    mask_path: str | None
+    viewpoint: dict[str, Any] | None
+    """`R`, `T`, `focal_length`, `principal_point` as they stand in the file; not checked yet."""
+    intrinsics_format: str
+
+
+@dataclass(frozen=True, slots=True)
+class SequenceAnnotation:
+    """What is known of a whole sequence."""
+
+    name: str
+    viewpoint_quality: float | None
+    point_cloud_path: str | None
+    point_cloud_quality: float | None
+
+
+def read_frame_annotations(file: Path) -> list[FrameAnnotation]:
+    """Every entry of a `frame_annotations.jgz`, in the file's order."""
+    return _parse_all(file, _frame)
+
+
+def read_sequence_annotations(file: Path) -> dict[str, SequenceAnnotation]:
+    """The entries of a `sequence_annotations.jgz` by their sequence's name."""
+    return {entry.name: entry for entry in _parse_all(file, _sequence)}
+
+
+def _parse_all(file: Path, parse: Any) -> list[Any]:
+    entries = require_list(read_json(file), "annotations", file)
+    parsed = []
+    for index, entry in enumerate(entries):
+        try:
+            parsed.append(parse(entry, file))
+        except KeyError as error:
+            raise InputError(
+                f"{file}: entry {index} has no {error}; is this a CO3D annotation file?"
+            ) from None
+        except InputError:
+            raise
+        except (TypeError, ValueError, AttributeError) as error:
+            raise InputError(
+                f"{file}: entry {index} is malformed ({error}); is this a CO3D annotation file?"
+            ) from None
+    return parsed
+
+
+def _frame(entry: dict[str, Any], file: Path) -> FrameAnnotation:
+    image, viewpoint = entry["image"], entry.get("viewpoint")
+    height, width = (_typed(side, int, "image size") for side in image["size"])
+    if height <= 0 or width <= 0:
+        raise ValueError(f"image size {height} x {width}")
+    # CO3D's first release has no format: it knew only this one.
+    ndc = (viewpoint or {}).get("intrinsics_format", "ndc_norm_image_bounds")
+    if ndc not in NDC_FORMATS:
+        raise ValueError(f"intrinsics_format {ndc!r} is none of {', '.join(NDC_FORMATS)}")
+    return FrameAnnotation(
+        sequence=_typed(entry["sequence_name"], str, "sequence_name"),
+        number=_typed(entry["frame_number"], int, "frame_number"),
+        image_path=_path(image["path"], file),
+        size=(height, width),
+        depth=_depth(entry.get("depth"), file),
+        mask_path=_optional_path(entry.get("mask"), "path", file),
+        viewpoint=viewpoint,
+        intrinsics_format=ndc,
+    )
+
+
+def _depth(entry: dict[str, Any] | None, file: Path) -> DepthFiles | None:
+    if not entry or not entry.get("path"):
+        return None
+    return DepthFiles(
+        path=_path(entry["path"], file),
+        scale=float(entry["scale_adjustment"]),
+        mask_path=_optional_path(entry, "mask_path", file),
+    )
+
+
+def _sequence(entry: dict[str, Any], file: Path) -> SequenceAnnotation:
+    cloud = entry.get("point_cloud")
+    return SequenceAnnotation(
+        name=_typed(entry["sequence_name"], str, "sequence_name"),
+        viewpoint_quality=_optional_float(entry.get("viewpoint_quality_score")),
+        point_cloud_path=_optional_path(cloud, "path", file),
+        point_cloud_quality=_optional_float(cloud.get("quality_score")) if cloud else None,
+    )
+
+
+def _path(value: Any, file: Path) -> str:
+    return check_relative(_typed(value, str, "path"), file)
+
+
+def _optional_path(entry: dict[str, Any] | None, key: str, file: Path) -> str | None:
+    value = entry.get(key) if entry else None
+    return _path(value, file) if value else None
+
+
+def _optional_float(value: Any) -> float | None:
+    return None if value is None else float(value)
+
+
+def _typed(value: Any, kind: type, what: str) -> Any:
+    if not isinstance(value, kind):
+        raise TypeError(f"{what} is {value!r}, expected {kind.__name__}")
+    return value

@@ -1,0 +1,219 @@
+"""CO3D downloads, first and second release, and everything else written in their layout.
+
+Images, masks and depth maps are read when a frame is; what is read at once are the annotations of
+one category. Depth is z in PyTorch3D's units, which are ours.
+"""
+
+import logging
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import torch
+
+from extrap_train.data.annotations import (
+    DepthFiles,
+    FrameAnnotation,
+    SequenceAnnotation,
+    read_frame_annotations,
+    read_sequence_annotations,
+)
+from extrap_train.data.files import check_relative, read_json, resolve_inside
+from extrap_train.data.images import (
+    known_depth,
+    read_depth_mask,
+    read_image,
+    read_mask,
+    read_sixteen_bit,
+)
+from extrap_train.data.sequences import Frame, Sequence
+from extrap_train.data.validation import did_you_mean, require_dict, require_sound
+from extrap_train.errors import InputError
+from extrap_train.geometry.pytorch3d import NdcFormat, Viewpoint, camera_from_viewpoint
+from extrap_train.views import Camera, View
+
+FRAME_ANNOTATIONS = "frame_annotations.jgz"
+SEQUENCE_ANNOTATIONS = "sequence_annotations.jgz"
+
+log = logging.getLogger(__name__)
+
+
+class FrameId(NamedTuple):
+    """An entry of a set list."""
+
+    sequence: str
+    number: int
+    path: str
+
+
+@dataclass(frozen=True)
+class _Photograph:
+    """One frame's files; a dataclass and no closure, so that worker processes can be sent it."""
+
+    root: Path
+    annotation: FrameAnnotation
+    camera: Camera
+
+    def load(self) -> View:
+        annotation, size = self.annotation, self.annotation.size
+        mask = annotation.mask_path
+        return View(
+            image=read_image(resolve_inside(self.root, annotation.image_path), size),
+            camera=self.camera,
+            depth=_read_depth(self.root, annotation.depth, size) if annotation.depth else None,
+            mask=read_mask(resolve_inside(self.root, mask), size) if mask else None,
+            name=Path(annotation.image_path).name,
+        )
+
+
+def list_categories(root: Path) -> list[str]:
+    """The categories that a CO3D folder holds."""
+    if not root.is_dir():
+        raise InputError(f"{root}: no such folder; set data.root to the CO3D download")
+    return sorted(file.parent.name for file in root.glob(f"*/{FRAME_ANNOTATIONS}"))
+
+
+def read_category(root: Path, category: str) -> list[Sequence]:
+    """All sequences of a category, by name; frames by number, those without a camera left out."""
+    known = list_categories(root)
+    if category not in known:
+        present = ", ".join(known) or f"none (no folder in it has a {FRAME_ANNOTATIONS})"
+        raise InputError(f"{root}: has no category {category!r}; categories present: {present}")
+    file = root / category / FRAME_ANNOTATIONS
+    frames = read_frame_annotations(file)
+    details = read_sequence_annotations(root / category / SEQUENCE_ANNOTATIONS)
+    posed: dict[str, list[FrameAnnotation]] = defaultdict(list)
+    for frame in frames:
+        if frame.viewpoint is not None:
+            posed[frame.sequence].append(frame)
+    without_camera = len(frames) - sum(map(len, posed.values()))
+    if without_camera:
+        log.warning("%s: %d frames have no camera and are left out", file, without_camera)
+    if not posed:
+        raise InputError(f"{file}: no frame has a camera; choose another category")
+    return [
+        _sequence(root, category, name, posed[name], details.get(name), file)
+        for name in sorted(posed)
+    ]
+
+
+def read_sequence(root: Path, category: str, name: str) -> Sequence:
+    """One sequence of a category."""
+    sequences = {sequence.name: sequence for sequence in read_category(root, category)}
+    if name not in sequences:
+        raise InputError(
+            f"{root / category}: has no sequence {name!r}; {did_you_mean(name, sequences)}"
+        )
+    return sequences[name]
+
+
+def read_set_list(root: Path, category: str, name: str) -> dict[str, list[FrameId]]:
+    """The subsets (`train`, `val`, `test`) of a set list, e.g. `manyview_dev_0`."""
+    file = root / category / "set_lists" / f"set_lists_{check_relative(name, root)}.json"
+    content = require_dict(read_json(file), "an object with a list per subset", file)
+    try:
+        return {
+            subset: [
+                FrameId(str(sequence), int(number), check_relative(path, file))
+                for sequence, number, path in entries
+            ]
+            for subset, entries in content.items()
+        }
+    except (TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(
+            f"{file}: entries must be [sequence, frame number, path] ({error}); check the file"
+        ) from None
+
+
+def _sequence(
+    root: Path,
+    category: str,
+    name: str,
+    annotations: list[FrameAnnotation],
+    details: SequenceAnnotation | None,
+    file: Path,
+) -> Sequence:
+    annotations.sort(key=lambda frame: frame.number)
+    photographs = [
+        _Photograph(root, annotation, camera)
+        for annotation, camera in zip(annotations, _cameras(annotations, file), strict=True)
+    ]
+    cloud = details.point_cloud_path if details else None
+    return Sequence(
+        category=category,
+        name=name,
+        frames=tuple(_frame(photograph) for photograph in photographs),
+        viewpoint_quality=details.viewpoint_quality if details else None,
+        point_cloud_quality=details.point_cloud_quality if details else None,
+        point_cloud=root / cloud if cloud else None,
+    )
+
+
+def _frame(photograph: _Photograph) -> Frame:
+    annotation = photograph.annotation
+    return Frame(
+        name=Path(annotation.image_path).name,
+        camera=photograph.camera,
+        has_depth=annotation.depth is not None,
+        has_mask=annotation.mask_path is not None,
+        load=photograph.load,
+    )
+
+
+def _cameras(annotations: list[FrameAnnotation], file: Path) -> list[Camera]:
+    """A camera a frame, converted together where size and format agree (one by one is slow)."""
+    groups: dict[tuple[tuple[int, int], str], list[int]] = defaultdict(list)
+    for index, annotation in enumerate(annotations):
+        groups[annotation.size, annotation.intrinsics_format].append(index)
+    cameras: dict[int, Camera] = {}
+    for ((height, width), ndc), members in groups.items():
+        names = [f"{annotations[i].sequence} frame {annotations[i].number}" for i in members]
+        viewpoints = [cast(dict[str, Any], annotations[i].viewpoint) for i in members]
+        batch = camera_from_viewpoint(
+            Viewpoint(
+                rotation=_stack(viewpoints, "R", (3, 3), names, file),
+                translation=_stack(viewpoints, "T", (3,), names, file),
+                focal_length=_stack(viewpoints, "focal_length", (2,), names, file),
+                principal_point=_stack(viewpoints, "principal_point", (2,), names, file),
+                intrinsics_format=cast(NdcFormat, ndc),
+            ),
+            height,
+            width,
+        )
+        require_sound(batch, names, file)
+        matrices = zip(members, batch.world_to_cam.float(), batch.intrinsics.float(), strict=True)
+        for index, world_to_cam, intrinsics in matrices:
+            cameras[index] = Camera(world_to_cam, intrinsics, height, width)
+    return [cameras[index] for index in range(len(annotations))]
+
+
+def _stack(
+    viewpoints: list[dict[str, Any]],
+    key: str,
+    shape: tuple[int, ...],
+    names: list[str],
+    file: Path,
+) -> torch.Tensor:
+    try:
+        values = np.array([viewpoint[key] for viewpoint in viewpoints], dtype=np.float64)
+    except (KeyError, TypeError, ValueError):
+        values = np.empty(0)
+    if values.shape != (len(viewpoints), *shape):
+        expected = " x ".join(map(str, shape))
+        raise InputError(
+            f"{file}: a viewpoint from {names[0]} to {names[-1]} has no {key} of {expected} "
+            "numbers; correct the entry"
+        )
+    return torch.from_numpy(values)
+
+
+def _read_depth(root: Path, files: DepthFiles, size: tuple[int, int]) -> torch.Tensor:
+    path = resolve_inside(root, files.path)
+    depth = known_depth(read_sixteen_bit(path, size).view(np.float16), files.scale, path)
+    if files.mask_path:
+        depth *= read_depth_mask(resolve_inside(root, files.mask_path), size)
+    return depth

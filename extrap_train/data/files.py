@@ -1,0 +1,89 @@
+"""Files from outside, read with care, and files of ours, written whole or not at all."""
+
+import gzip
+import json
+import os
+import zlib
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
+
+from extrap_train.errors import InputError
+
+GZIP_FLOOR_BYTES = 64 * 2**20
+GZIP_RATIO = 100
+"""Annotations shrink to between a third and a tenth; a decompression bomb, to a thousandth."""
+
+
+def check_relative(relative: str, file: Path) -> str:
+    """`relative` unchanged, if its text cannot lead out of a folder; `file` is where it stood."""
+    posix, windows = PurePosixPath(relative), PureWindowsPath(relative)
+    leaves = windows.drive or windows.root or ".." in windows.parts or "\0" in relative
+    if leaves or not posix.parts:
+        raise InputError(
+            f"{file}: the path {relative!r} is absolute, empty or climbs out of its folder; "
+            "only paths below the data set's root can be read: correct the entry"
+        )
+    return relative
+
+
+def resolve_inside(root: Path, relative: str) -> Path:
+    """The real path of an existing file below `root`, symbolic links followed.
+
+    Raises InputError where it is missing or where a link leads out of `root`.
+    """
+    path = root / relative
+    resolved = path.resolve()
+    if not resolved.is_relative_to(root.resolve()):
+        raise InputError(
+            f"{path}: leads out of {root} to {resolved}; copy the file into the data set instead"
+        )
+    if not resolved.is_file():
+        raise InputError(f"{path}: no such file; restore it or remove its entry")
+    return resolved
+
+
+def read_json(path: Path) -> Any:
+    """The content of a JSON file; `.jgz` and `.gz` files are gzip-compressed."""
+    try:
+        content = _gunzip(path) if path.suffix in (".jgz", ".gz") else path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; is the download complete?") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error}); check the file") from None
+    try:
+        return json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: is not valid JSON ({error}); download it again") from None
+
+
+def _gunzip(path: Path) -> bytes:
+    limit = GZIP_FLOOR_BYTES + GZIP_RATIO * path.stat().st_size
+    try:
+        with gzip.open(path) as file:
+            content = file.read(limit + 1)
+    except gzip.BadGzipFile:
+        raise InputError(f"{path}: is not a gzip file; download it again") from None
+    except (EOFError, zlib.error):
+        raise InputError(f"{path}: is a truncated or damaged gzip file; get it again") from None
+    if len(content) > limit:
+        raise InputError(
+            f"{path}: expands to more than {limit >> 20} MiB, which no real annotation file does; "
+            "download it again from a source you trust"
+        )
+    return content
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file so that it is there complete or not at all; makes the folders above it."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            temporary.write_bytes(content)
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be written ({error.strerror}); free space or choose another folder"
+        ) from None

@@ -1,0 +1,62 @@
+"""Checks that every reader shares."""
+
+import difflib
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from extrap_train.errors import InputError
+from extrap_train.views import Camera
+
+ROTATION_TOLERANCE = 1e-3
+"""Largest deviation of R Rᵀ from the identity; rotations stored as float32 stay below 1e-5."""
+
+
+def is_degenerate(camera: Camera) -> Bool[Tensor, "*b"]:
+    """Whether a camera is not finite, has no rotation, or a focal length that is not positive."""
+    rotation = camera.world_to_cam[..., :3, :3]
+    focal = camera.intrinsics.diagonal(dim1=-2, dim2=-1)[..., :2]
+    finite = (camera.world_to_cam.sum((-2, -1)) + camera.intrinsics.sum((-2, -1))).isfinite()
+    deviation = (rotation @ rotation.mT - torch.eye(3, dtype=rotation.dtype)).abs().amax((-2, -1))
+    right_handed = torch.linalg.det(rotation.nan_to_num()) > 0
+    return ~(finite & (deviation < ROTATION_TOLERANCE) & right_handed & (focal > 0).all(-1))
+
+
+def require_sound(cameras: Camera, names: Collection[str], file: Path) -> None:
+    """Raise InputError that names the first degenerate camera of those read from `file`."""
+    for name, degenerate in zip(names, is_degenerate(cameras).tolist(), strict=True):
+        if degenerate:
+            raise InputError(
+                f"{file}: the camera of {name} is degenerate (NaN, no rotation, or a focal length "
+                "that is not positive); correct or remove its entry"
+            )
+
+
+def require_list(content: Any, what: str, file: Path) -> list[Any]:
+    """`content`, if it is a list with something in it."""
+    if not isinstance(content, list) or not content:
+        raise InputError(
+            f"{file}: expected {what} in a list, found {_kind(content)}; check the file"
+        )
+    return content
+
+
+def require_dict(content: Any, what: str, file: Path) -> dict[str, Any]:
+    """`content`, if it is a JSON object."""
+    if not isinstance(content, dict):
+        raise InputError(f"{file}: expected {what}, found {_kind(content)}; check the file")
+    return content
+
+
+def did_you_mean(name: str, known: Collection[str]) -> str:
+    """`did you mean a, b?` with the names that look like `name`, or the first few known ones."""
+    near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
+    return f"did you mean {', '.join(near)}?" if near else f"known: {', '.join(sorted(known)[:8])}"
+
+
+def _kind(content: Any) -> str:
+    return "an empty list" if content == [] else f"a {type(content).__name__}"
