@@ -48,23 +48,29 @@ class FrameId(NamedTuple):
     path: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class _Photograph:
     """One frame's files; a dataclass and no closure, so that worker processes can be sent it."""
 
     root: Path
-    annotation: FrameAnnotation
+    image_path: str
+    depth: DepthFiles | None
+    mask_path: str | None
     camera: Camera
 
+    @property
+    def name(self) -> str:
+        return self.image_path.rpartition("/")[2]
+
     def load(self) -> View:
-        annotation, size = self.annotation, self.annotation.size
-        mask = annotation.mask_path
+        size = self.camera.height, self.camera.width
+        mask_path = self.mask_path and resolve_inside(self.root, self.mask_path)
         return View(
-            image=read_image(resolve_inside(self.root, annotation.image_path), size),
+            image=read_image(resolve_inside(self.root, self.image_path), size),
             camera=self.camera,
-            depth=_read_depth(self.root, annotation.depth, size) if annotation.depth else None,
-            mask=read_mask(resolve_inside(self.root, mask), size) if mask else None,
-            name=Path(annotation.image_path).name,
+            depth=_read_depth(self.root, self.depth, size) if self.depth else None,
+            mask=read_mask(mask_path, size) if mask_path else None,
+            name=self.name,
         )
 
 
@@ -82,21 +88,26 @@ def read_category(root: Path, category: str) -> list[Sequence]:
         present = ", ".join(known) or f"none (no folder in it has a {FRAME_ANNOTATIONS})"
         raise InputError(f"{root}: has no category {category!r}; categories present: {present}")
     file = root / category / FRAME_ANNOTATIONS
-    frames = read_frame_annotations(file)
     details = read_sequence_annotations(root / category / SEQUENCE_ANNOTATIONS)
-    posed: dict[str, list[FrameAnnotation]] = defaultdict(list)
-    for frame in frames:
-        if frame.viewpoint is not None:
-            posed[frame.sequence].append(frame)
-    without_camera = len(frames) - sum(map(len, posed.values()))
-    if without_camera:
-        log.warning("%s: %d frames have no camera and are left out", file, without_camera)
-    if not posed:
-        raise InputError(f"{file}: no frame has a camera; choose another category")
+    posed = _posed_by_sequence(file)
     return [
         _sequence(root, category, name, posed[name], details.get(name), file)
         for name in sorted(posed)
     ]
+
+
+def _posed_by_sequence(file: Path) -> dict[str, list[FrameAnnotation]]:
+    annotations = read_frame_annotations(file)
+    posed: dict[str, list[FrameAnnotation]] = defaultdict(list)
+    for annotation in annotations:
+        if annotation.viewpoint is not None:
+            posed[annotation.sequence].append(annotation)
+    without_camera = len(annotations) - sum(map(len, posed.values()))
+    if without_camera:
+        log.warning("%s: %d frames have no camera and are left out", file, without_camera)
+    if not posed:
+        raise InputError(f"{file}: no frame has a camera; choose another category")
+    return posed
 
 
 def read_sequence(root: Path, category: str, name: str) -> Sequence:
@@ -137,27 +148,28 @@ def _sequence(
     details: SequenceAnnotation | None,
     file: Path,
 ) -> Sequence:
-    annotations.sort(key=lambda frame: frame.number)
-    photographs = [
-        _Photograph(root, annotation, camera)
-        for annotation, camera in zip(annotations, _cameras(annotations, file), strict=True)
-    ]
+    annotations.sort(key=lambda annotation: annotation.number)
     cloud = details.point_cloud_path if details else None
     return Sequence(
         category=category,
         name=name,
-        frames=tuple(_frame(photograph) for photograph in photographs),
+        frames=tuple(
+            _frame(root, annotation, camera)
+            for annotation, camera in zip(annotations, _cameras(annotations, file), strict=True)
+        ),
         viewpoint_quality=details.viewpoint_quality if details else None,
         point_cloud_quality=details.point_cloud_quality if details else None,
         point_cloud=root / cloud if cloud else None,
     )
 
 
-def _frame(photograph: _Photograph) -> Frame:
-    annotation = photograph.annotation
+def _frame(root: Path, annotation: FrameAnnotation, camera: Camera) -> Frame:
+    photograph = _Photograph(
+        root, annotation.image_path, annotation.depth, annotation.mask_path, camera
+    )
     return Frame(
-        name=Path(annotation.image_path).name,
-        camera=photograph.camera,
+        name=photograph.name,
+        camera=camera,
         has_depth=annotation.depth is not None,
         has_mask=annotation.mask_path is not None,
         load=photograph.load,

@@ -3,8 +3,9 @@
 import gzip
 import json
 import os
+import re
 import zlib
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path
 from typing import Any
 
 from extrap_train.errors import InputError
@@ -13,12 +14,13 @@ GZIP_FLOOR_BYTES = 64 * 2**20
 GZIP_RATIO = 100
 """Annotations shrink to between a third and a tenth; a decompression bomb, to a thousandth."""
 
+# Absolute, on a Windows drive, with a `..` among its parts, or with a NUL that would end it early.
+_LEAVES_FOLDER = re.compile(r"^[/\\]|^[A-Za-z]:|(^|[/\\])\.\.([/\\]|$)|\0")
+
 
 def check_relative(relative: str, file: Path) -> str:
     """`relative` unchanged, if its text cannot lead out of a folder; `file` is where it stood."""
-    posix, windows = PurePosixPath(relative), PureWindowsPath(relative)
-    leaves = windows.drive or windows.root or ".." in windows.parts or "\0" in relative
-    if leaves or not posix.parts:
+    if not relative or _LEAVES_FOLDER.search(relative):
         raise InputError(
             f"{file}: the path {relative!r} is absolute, empty or climbs out of its folder; "
             "only paths below the data set's root can be read: correct the entry"
