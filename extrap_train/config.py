@@ -7,6 +7,8 @@ this file says what may stand in them.
 from dataclasses import dataclass, field
 from typing import Any
 
+from extrap_train.errors import InputError
+
 MISSING: Any = "???"  # OmegaConf's mark for "must be given"
 
 CATEGORIES = ("apple", "book", "chair", "cup", "hydrant", "teddybear")
@@ -50,7 +52,6 @@ class Co3dConfig(DataConfig):
     """A CO3D v1 or v2 download."""
 
     name: str = "co3d"
-    root: str | None = MISSING
     test_sequences: int = 5
     """Held out, drawn by a hash of the sequence's name; a lone sequence holds out frames instead."""
 
@@ -94,11 +95,11 @@ class PrepConfig:
     """Least azimuth covered around the fitted orbit axis."""
     min_viewpoint_quality: float = 0.0
     min_point_cloud_quality: float = -2.0
-    max_uses: int = 12
+    max_uses: int = 16
     """Most pairs that one frame takes part in."""
     min_pair_angle_deg: float = 8.0
     max_pair_angle_deg: float = 88.0
-    near_duplicate_deg: float = 4.0
+    near_duplicate_deg: float = 6.0
     """A pair is skipped if a chosen one has both its frames within this angle of its own."""
     full_circle_only: bool = True
 
@@ -107,11 +108,11 @@ class PrepConfig:
 class UNetConfig:
     """Shape of the denoiser (diffusers' `UNet2DConditionModel`)."""
 
-    channels: list[int] = field(default_factory=lambda: [96, 192, 288])
+    channels: list[int] = field(default_factory=lambda: [64, 128, 192])
     layers_per_block: int = 1
     attention_levels: list[bool] = field(default_factory=lambda: [False, False, True])
     heads: int = 4
-    token_width: int = 256
+    token_width: int = 192
     """Width of the one cross-attention token."""
 
 
@@ -123,6 +124,8 @@ class ModelConfig:
     image_size: int = 64
     patch: int = 2
     """Pixels a side that become channels of one latent: the small model's stand-in for a VAE."""
+    references: int = 3
+    """Most references that a view is warped from (paper III-A.4)."""
     octaves: int = 4
     """Of the positional encoding: 4 channels each."""
     residual: bool = True
@@ -212,3 +215,67 @@ class DataPrepConfig:
     output: str = "outputs"
     workers: int | None = None
     """Processes; null takes every core."""
+
+
+def dotted(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """A nested mapping as one of dotted keys."""
+    items: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            items |= dotted(value, f"{prefix}{key}.")
+        else:
+            items[prefix + key] = value
+    return items
+
+
+def validate(config: TrainConfig | DataPrepConfig, tasks: tuple[str, ...]) -> None:
+    """Check what types cannot say; raises InputError naming the option, its value and the remedy."""
+    _check_prep(config.prep)
+    if isinstance(config.data, Co3dConfig) and not config.data.root:
+        raise InputError("data=co3d needs the folder of the download: give data.root=FOLDER")
+    if isinstance(config, TrainConfig):
+        _check_one_of("task", config.task, tasks)
+        _check_model(config.model, config.prep)
+        _check_positive("trainer", config.trainer, ("steps", "batch_size", "checkpoint_every", "validate_every"))
+        _check_positive("sampler", config.sampler, ("steps",))
+        _check_positive("validation", config.validation, ("examples", "batch_size", "pictures"))
+
+
+def _check_prep(prep: PrepConfig) -> None:
+    _check_positive("prep", prep, ("image_size", "max_uses"))
+    if not 0 <= prep.min_pair_angle_deg < prep.max_pair_angle_deg <= 90:
+        raise InputError(
+            f"prep.min_pair_angle_deg={prep.min_pair_angle_deg} and "
+            f"prep.max_pair_angle_deg={prep.max_pair_angle_deg}: need 0 ≤ min < max ≤ 90"
+        )
+
+
+def _check_model(model: ModelConfig, prep: PrepConfig) -> None:
+    _check_one_of("model.prediction", model.prediction, ("epsilon", "v_prediction", "sample"))
+    if model.image_size != prep.image_size:
+        raise InputError(
+            f"model.image_size={model.image_size} but prep.image_size={prep.image_size}: give both the same"
+        )
+    coarsest = model.patch * 2 ** (len(model.unet.channels) - 1)
+    if model.image_size % coarsest:
+        raise InputError(
+            f"model.image_size={model.image_size} is no multiple of {coarsest}, which model.patch and the "
+            "levels of model.unet.channels need"
+        )
+    if len(model.unet.channels) != len(model.unet.attention_levels):
+        raise InputError("model.unet.channels and model.unet.attention_levels differ in length")
+    if model.zero_terminal_snr and model.prediction == "epsilon":
+        raise InputError(
+            "model.prediction=epsilon says nothing at zero terminal SNR: give model.zero_terminal_snr=false"
+        )
+
+
+def _check_one_of(name: str, value: str, known: tuple[str, ...]) -> None:
+    if value not in known:
+        raise InputError(f"{name}={value} is unknown; known: {', '.join(known)}")
+
+
+def _check_positive(group: str, options: Any, names: tuple[str, ...]) -> None:
+    for name in names:
+        if getattr(options, name) <= 0:
+            raise InputError(f"{group}.{name}={getattr(options, name)}: must be above 0")

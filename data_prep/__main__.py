@@ -1,0 +1,31 @@
+"""`python -m data_prep`: sequences in, pair data set and report out."""
+
+import os
+from pathlib import Path
+
+from extrap_train.cli import command
+from extrap_train.config import DataPrepConfig
+
+
+def _run(config: DataPrepConfig) -> None:
+    from extrap_train.tasks.prepare import prepare_category
+
+    for member in config.category.members:
+        prepare_category(
+            member,
+            config.data,
+            config.depth,
+            config.prep,
+            output=Path(config.output),
+            workers=config.workers or os.cpu_count() or 1,
+            seed=config.seed,
+        )
+
+
+def main() -> None:
+    """Entry point of `data-prep`."""
+    command("prep", _run)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,18 @@
+"""`python -m extrap_train`: configuration to task, nothing else."""
+
+from extrap_train.cli import command
+from extrap_train.config import TrainConfig
+from extrap_train.tasks import task
+
+
+def _run(config: TrainConfig) -> None:
+    task(config.task)(config)
+
+
+def main() -> None:
+    """Entry point of `extrap-train`."""
+    command("train", _run)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,124 @@
+"""The command line of every Hydra entry point: typed configuration in, one clear line out when it is wrong."""
+
+import difflib
+import os
+import re
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import hydra
+from hydra.core.config_store import ConfigStore
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from extrap_train import config as schema
+from extrap_train.errors import InputError
+from extrap_train.tasks import TASKS
+
+_GROUPS: dict[str, list[type]] = {
+    "category": [schema.CategoryConfig],
+    "data": [schema.SyntheticConfig, schema.Co3dConfig],
+    "depth": [schema.DatasetDepthConfig, schema.StereoConfig],
+    "model": [schema.ModelConfig],
+}
+
+
+def register_schemas() -> None:
+    """Make the dataclasses known to Hydra, as `<name>_schema`."""
+    store = ConfigStore.instance()
+    store.store(name="train_schema", node=schema.TrainConfig)
+    store.store(name="prep_schema", node=schema.DataPrepConfig)
+    for group, variants in _GROUPS.items():
+        for variant in variants:
+            name = variant.name if len(variants) > 1 else group  # type: ignore[attr-defined]
+            store.store(group=group, name=f"{name}_schema", node=variant)
+
+
+def command(name: str, run: Callable[[Any], None]) -> None:
+    """Compose the configuration `conf/<name>.yaml` with the command line's overrides and run it.
+
+    An option that does not exist, a value of the wrong type, an unknown category and unusable input end
+    with one line on stderr and exit status 1.
+    """
+    register_schemas()
+
+    @hydra.main(version_base="1.3", config_path="pkg://conf", config_name=name)
+    def composed(config: DictConfig) -> None:
+        typed = typed_config(config)
+        _use_threads(getattr(typed, "threads", None))
+        run(typed)
+
+    try:
+        _check(name, sys.argv[1:])
+        os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # what is left to go wrong is a bug
+        composed()
+    except InputError as error:
+        sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        sys.exit("interrupted: run the same command again to resume")
+
+
+def typed_config(config: DictConfig) -> Any:
+    """The dataclass tree of a composed configuration, checked beyond its types."""
+    missing = sorted(str(key) for key in OmegaConf.missing_keys(config) if key != "hydra")
+    if missing:
+        raise InputError(f"an option has no value: give {missing[0]}=VALUE")
+    typed = OmegaConf.to_object(config)
+    schema.validate(typed, TASKS)
+    return typed
+
+
+def _check(name: str, arguments: list[str]) -> None:
+    """Compose once before Hydra does, so that its errors can be said in one line with a suggestion."""
+    overrides = [a for a in arguments if "=" in a and not a.startswith("-")]
+    if {"--help", "-h"} & set(arguments):
+        if not any(o.startswith(("category=", "experiment=")) for o in overrides):
+            sys.argv.append("category=hydrant")  # help shows a whole tree
+        return
+    if {"-m", "--multirun", "--hydra-help", "--version"} & set(arguments):
+        return
+    try:
+        with hydra.initialize_config_module("conf", version_base="1.3"):
+            typed_config(hydra.compose(name, overrides))
+    except (HydraException, OmegaConfBaseException) as error:
+        raise InputError(_one_line(error, overrides)) from None
+
+
+def _one_line(error: Exception, overrides: list[str]) -> str:
+    text = " ".join(f"{error} {error.__cause__ or ''}".split())
+    group = re.search(r"Could not find '(\w+)/([^']+)' Available options in '\w+': (.*?)(?= Config)", text)
+    if group:
+        kind, value, known = group.groups()
+        names = [n for n in known.split() if not n.endswith("_schema")]
+        return f"{kind}={value} is unknown{_suggest(value, names)}; known: {', '.join(names)}"
+    required = re.search(r"You must specify '(\w+)'.*?Available options:(.*)", text)
+    if required:
+        names = [n for n in required[2].split() if not n.endswith("_schema")]
+        return f"{required[1]} is not given: {required[1]}={'|'.join(names)}"
+    unknown = re.search(r"Key '(\w+)' (?:is )?not in", text) or re.search(r"Could not override '([\w.]+)'", text)
+    if unknown:
+        keys = [o.partition("=")[0].lstrip("+~") for o in overrides]
+        given = next((key for key in keys if key.endswith(unknown[1])), unknown[1])
+        return f"there is no option {given}{_suggest(given, _known_options())}; see --help"
+    return text
+
+
+def _known_options() -> list[str]:
+    tree = OmegaConf.to_container(OmegaConf.structured(schema.TrainConfig))
+    groups = {group: variants for group, variants in _GROUPS.items()}
+    assert isinstance(tree, dict)
+    names = [f"{g}.{f}" for g, vs in groups.items() for v in vs for f in v.__dataclass_fields__]
+    return [*schema.dotted(tree), *names, *groups]
+
+
+def _suggest(given: str, known: list[str]) -> str:
+    near = difflib.get_close_matches(given, known, n=1, cutoff=0.5)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+def _use_threads(threads: int | None) -> None:
+    if threads is not None:
+        os.environ["OMP_NUM_THREADS"] = str(threads)
+        os.environ["NUMBA_NUM_THREADS"] = str(threads)

@@ -1,0 +1,105 @@
+"""One training example: a query frame and its references, read from prepared data."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from extrap_train.data.store import PreparedData
+from extrap_train.geometry.viewpoints import extra_references, pairwise_angles, scene_center
+from extrap_train.views import Camera, PairBatch, stack_cameras
+
+
+@dataclass(frozen=True)
+class Example:
+    """A query and one to `k` references, nearest first."""
+
+    image: Float[Tensor, "3 h w"]
+    camera: Camera
+    reference_images: Float[Tensor, "k 3 h w"]
+    reference_cameras: Camera
+    reference_depths: Float[Tensor, "k h w"]
+
+
+def mirrored(example: Example) -> Example:
+    """The example in a mirror: left and right exchanged in images, cameras and world alike."""
+    return Example(
+        example.image.flip(-1),
+        _mirrored_camera(example.camera),
+        example.reference_images.flip(-1),
+        _mirrored_camera(example.reference_cameras),
+        example.reference_depths.flip(-1),
+    )
+
+
+def _mirrored_camera(camera: Camera) -> Camera:
+    """Reflect the world and the camera along x: the product of both keeps the rotation proper."""
+    mirror = torch.diag(camera.world_to_cam.new_tensor([-1.0, 1.0, 1.0, 1.0]))
+    intrinsics = camera.intrinsics.clone()
+    intrinsics[..., 0, 2] = camera.width - intrinsics[..., 0, 2]
+    return replace(
+        camera, world_to_cam=mirror @ camera.world_to_cam @ mirror, intrinsics=intrinsics
+    )
+
+
+class ExampleReader:
+    """Examples of one split of one or several prepared categories."""
+
+    def __init__(self, prepared: list[PreparedData], split: str, references: int) -> None:
+        self.references = references
+        self._prepared = prepared
+        self._pairs = [(data, pair) for data in prepared for pair in data.pairs(split)]
+        self._angles: dict[tuple[int, str], np.ndarray] = {}
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def name(self, index: int) -> str:
+        """Unique name of a pair: folder, sequence, query and reference."""
+        data, pair = self._pairs[index]
+        return f"{data.folder.name}/{pair.sequence}/{pair.query}-{pair.references[0]}"
+
+    def angle_rad(self, index: int) -> float:
+        """Angle between the query and its nearest reference, seen from the scene's centre."""
+        data, pair = self._pairs[index]
+        return float(self._angles_of(data, pair.sequence)[pair.query, pair.references[0]])
+
+    def read(self, index: int, count: int, rng: np.random.Generator) -> Example:
+        """The pair's example with up to `count` references; those behind the first are drawn."""
+        data, pair = self._pairs[index]
+        first = pair.references[0]
+        angles = self._angles_of(data, pair.sequence)
+        candidates = data.reference_frames(pair.sequence)
+        further = extra_references(angles, pair.query, first, count - 1, candidates, rng)
+        frames = [pair.query, first, *further]
+        images, depths, _ = data.frames(pair.sequence, frames)
+        cameras = data.cameras(pair.sequence)[torch.tensor(frames)]
+        return Example(images[0], cameras[0], images[1:], cameras[1:], depths[1:])
+
+    def collate(self, examples: list[Example]) -> PairBatch:
+        """A batch with room for `references`; missing ones are the first again, marked invalid."""
+        orders = [
+            [i if i < len(e.reference_images) else 0 for i in range(self.references)]
+            for e in examples
+        ]
+        valid = [[i < len(e.reference_images) for i in range(self.references)] for e in examples]
+        pairs = list(zip(examples, orders, strict=True))
+        return PairBatch(
+            image=torch.stack([e.image for e in examples]),
+            camera=stack_cameras([e.camera for e in examples]),
+            reference_images=torch.stack([e.reference_images[o] for e, o in pairs]),
+            reference_cameras=stack_cameras(
+                [e.reference_cameras[torch.tensor(o)] for e, o in pairs]
+            ),
+            reference_depths=torch.stack([e.reference_depths[o] for e, o in pairs]),
+            reference_valid=torch.tensor(valid),
+        )
+
+    def _angles_of(self, data: PreparedData, sequence: str) -> np.ndarray:
+        key = (id(data), sequence)
+        if key not in self._angles:
+            cameras = data.cameras(sequence)
+            self._angles[key] = pairwise_angles(cameras, scene_center(cameras))
+        return self._angles[key]

@@ -1,0 +1,162 @@
+"""Batches for training and validation, a pure function of the seed and of the step they are for."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import lightning
+import numpy as np
+import torch
+from torch.utils.data import DataLoader, Dataset, Sampler
+
+from extrap_train.data.examples import ExampleReader, mirrored
+from extrap_train.geometry.warp import warp_references
+from extrap_train.views import PairBatch
+
+Positions = list[tuple[int, int]]
+"""(position in the endless stream of examples, index of the pair)."""
+
+
+def with_warp(batch: PairBatch) -> PairBatch:
+    """The batch with its warp, made on the device where the batch lies."""
+    if batch.warp is not None:
+        return batch
+    warp = warp_references(
+        batch.reference_images,
+        batch.reference_depths,
+        batch.reference_cameras,
+        batch.reference_valid,
+        batch.camera,
+    )
+    return replace(batch, warp=warp)
+
+
+class PositionSampler(Sampler[Positions]):
+    """Batches of one epoch from an endless stream of shuffled passes over the pairs.
+
+    Nothing is remembered: epoch `e` of a run that was killed is the epoch `e` that it would have been.
+    """
+
+    def __init__(
+        self, pairs: int, batch_size: int, batches: int, seed: int, rank: int = 0, world: int = 1
+    ) -> None:
+        self.pairs, self.batch_size, self.batches, self.seed = pairs, batch_size, batches, seed
+        self.rank, self.world, self.epoch = rank, world, 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Called by Lightning before every epoch."""
+        self.epoch = epoch
+
+    def __len__(self) -> int:
+        return self.batches
+
+    def __iter__(self) -> Iterator[Positions]:
+        orders: dict[int, np.ndarray] = {}
+        first = self.epoch * self.batches * self.batch_size * self.world
+        for batch in range(self.batches):
+            start = first + (batch * self.world + self.rank) * self.batch_size
+            positions = range(start, start + self.batch_size)
+            for cycle in {position // self.pairs for position in positions} - orders.keys():
+                orders = {k: v for k, v in orders.items() if k >= cycle - 1}
+                orders[cycle] = np.random.default_rng((self.seed, cycle)).permutation(self.pairs)
+            yield [(p, int(orders[p // self.pairs][p % self.pairs])) for p in positions]
+
+
+class TrainingBatches(Dataset[PairBatch]):
+    """Whole batches by their positions: one to `k` references, every other example mirrored."""
+
+    def __init__(self, reader: ExampleReader, references: int, seed: int) -> None:
+        self.reader, self.references, self.seed = reader, references, seed
+
+    def __getitem__(self, positions: Positions) -> PairBatch:
+        examples = []
+        for position, pair in positions:
+            rng = np.random.default_rng((self.seed, position))
+            count = int(rng.integers(1, self.references + 1))
+            example = self.reader.read(pair, count, rng)
+            examples.append(mirrored(example) if rng.random() < 0.5 else example)
+        return self.reader.collate(examples)
+
+
+class ValidationBatches(Dataset[PairBatch]):
+    """The same examples, with all their references, every time."""
+
+    def __init__(
+        self, reader: ExampleReader, chosen: list[int], size: int, references: int
+    ) -> None:
+        self.reader, self.references = reader, references
+        self.batches = [chosen[i : i + size] for i in range(0, len(chosen), size)]
+
+    def __len__(self) -> int:
+        return len(self.batches)
+
+    def __getitem__(self, index: int) -> PairBatch:
+        rngs = [np.random.default_rng(pair) for pair in self.batches[index]]
+        chosen = zip(self.batches[index], rngs, strict=True)
+        return self.reader.collate([self.reader.read(p, self.references, rng) for p, rng in chosen])
+
+
+class PairModule(lightning.LightningDataModule):
+    """Training and validation batches; the warp is made after the batch has reached its device."""
+
+    def __init__(
+        self,
+        train: ExampleReader,
+        validation: ExampleReader,
+        *,
+        batch_size: int,
+        batches_per_epoch: int,
+        validation_examples: int,
+        validation_batch_size: int,
+        references: int,
+        workers: int,
+        seed: int,
+    ) -> None:
+        super().__init__()
+        self.train, self.validation = train, validation
+        self.batch_size, self.batches_per_epoch = batch_size, batches_per_epoch
+        self.validation_batch_size, self.references = validation_batch_size, references
+        self.workers, self.seed = workers, seed
+        self.chosen = spread(len(validation), validation_examples)
+
+    def train_dataloader(self) -> DataLoader[PairBatch]:
+        """One epoch: the batches between two checkpoints."""
+        trainer = self.trainer
+        sampler = PositionSampler(
+            len(self.train),
+            self.batch_size,
+            self.batches_per_epoch,
+            self.seed,
+            trainer.global_rank if trainer else 0,
+            trainer.world_size if trainer else 1,
+        )
+        dataset = TrainingBatches(self.train, self.references, self.seed)
+        return self._loader(dataset, sampler)
+
+    def val_dataloader(self) -> DataLoader[PairBatch]:
+        """Held-out examples, spread evenly over the test pairs."""
+        return self._loader(
+            ValidationBatches(
+                self.validation, self.chosen, self.validation_batch_size, self.references
+            )
+        )
+
+    def _loader(
+        self, dataset: Dataset[PairBatch], sampler: Sampler[Positions] | None = None
+    ) -> DataLoader[PairBatch]:
+        return DataLoader(
+            dataset,
+            batch_size=None,
+            sampler=sampler,
+            num_workers=self.workers,
+            persistent_workers=self.workers > 0,
+        )
+
+    def on_after_batch_transfer(self, batch: PairBatch, dataloader_idx: int) -> PairBatch:
+        """Lightning's hook: warps are computed, not stored."""
+        return with_warp(batch)
+
+
+def spread(available: int, wanted: int) -> list[int]:
+    """Indices spread evenly over `available` places."""
+    count = min(available, wanted)
+    return torch.linspace(0, available - 1, count).round().long().tolist() if count else []

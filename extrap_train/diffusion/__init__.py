@@ -1,0 +1,1 @@
+"""The category model: conditioning, denoiser, training and sampling (paper II-B)."""

@@ -1,0 +1,177 @@
+"""How a run survives: whole checkpoints, a metrics table that knows its step, averaged weights, a progress bar."""
+
+import csv
+import io
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning import LightningModule, Trainer
+from lightning.fabric.plugins import TorchCheckpointIO
+from lightning.pytorch.callbacks import Callback, WeightAveraging
+from lightning.pytorch.loggers import Logger
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from torch import Tensor
+
+from extrap_train.data.files import write_whole
+from extrap_train.errors import InputError
+
+_KEPT = 2
+
+
+class WholeCheckpointIO(TorchCheckpointIO):
+    """Writes a checkpoint complete or not at all, and loads it without running any code from it."""
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: Any = None
+    ) -> None:
+        """Write under a temporary name, then rename."""
+        content = io.BytesIO()
+        torch.save(checkpoint, content)
+        write_whole(Path(path), content.getvalue())
+
+    def load_checkpoint(
+        self,
+        path: str | os.PathLike[str],
+        map_location: Any = lambda storage, location: storage,
+        weights_only: bool | None = True,
+    ) -> dict[str, Any]:
+        """Load tensors and plain values only."""
+        return torch.load(path, map_location=map_location, weights_only=True)
+
+
+class EpochCheckpoints(Callback):
+    """Saves at the end of every epoch and keeps the newest two.
+
+    Epochs are as long as the distance between checkpoints, so that a resumed run starts at the first batch
+    of an epoch and sees exactly the batches that it would have seen.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Save, then drop what is older."""
+        trainer.save_checkpoint(self.folder / f"step-{trainer.global_step:08d}.ckpt")
+        if trainer.is_global_zero:
+            for old in checkpoints(self.folder)[:-_KEPT]:
+                old.unlink()
+
+
+def checkpoints(folder: Path) -> list[Path]:
+    """Complete checkpoints, oldest first."""
+    return sorted(folder.glob("step-*.ckpt"))
+
+
+class AveragedWeights(WeightAveraging):
+    """Exponential moving average whose memory grows with the run: decay min(d, (1 + n)/(10 + n))."""
+
+    def __init__(self, decay: float) -> None:
+        def average(mean: Tensor, value: Tensor, count: Tensor | int) -> Tensor:
+            ramp = (1 + int(count)) / (10 + int(count))
+            return mean.lerp(value, 1 - min(decay, ramp))
+
+        super().__init__(avg_fn=average)
+
+
+class MetricsTable(Logger):
+    """`metrics.csv`: a row per logged step; a resumed run drops the rows behind its checkpoint."""
+
+    def __init__(self, path: Path, resumed_step: int) -> None:
+        super().__init__()
+        self.path = path
+        self._rows = [row for row in _read(path) if int(row["step"]) <= resumed_step]
+
+    @property
+    def name(self) -> str:
+        """Lightning's name of the logger."""
+        return "metrics"
+
+    @property
+    def version(self) -> str:
+        """Lightning's version of the logger; there is one table a run."""
+        return "0"
+
+    def log_hyperparams(self, params: Any, *args: Any, **kwargs: Any) -> None:
+        """Nothing: `config.yaml` holds them."""
+
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        """Collect a row; rows of the same step are one."""
+        row = {name: f"{value:.6g}" for name, value in metrics.items() if name != "epoch"}
+        if self._rows and self._rows[-1]["step"] == str(step):
+            self._rows[-1] |= row
+        else:
+            self._rows.append({"step": str(step), **row})
+
+    def save(self) -> None:
+        """Write the table whole."""
+        columns = list(dict.fromkeys(name for row in self._rows for name in row))
+        text = io.StringIO()
+        writer = csv.DictWriter(text, columns, restval="")
+        writer.writeheader()
+        writer.writerows(self._rows)
+        write_whole(self.path, text.getvalue().encode())
+
+
+def _read(path: Path) -> list[dict[str, str]]:
+    if not path.is_file():
+        return []
+    with path.open(newline="") as file:
+        return [{k: v for k, v in row.items() if v} for row in csv.DictReader(file)]
+
+
+class StepProgress(Callback):
+    """One bar for the whole run: steps, time left, loss, and the last validation."""
+
+    def __init__(self, steps: int) -> None:
+        self.steps = steps
+        self._bar: Progress | None = None
+        self._task = TaskID(0)
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Open the bar at the step that the run resumes from."""
+        self._bar = Progress(
+            TextColumn("train"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[note]}"),
+            disable=not trainer.is_global_zero,
+        )
+        self._bar.start()
+        self._task = self._bar.add_task(
+            "train", total=self.steps, completed=trainer.global_step, note=""
+        )
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Advance, and stop with a clear word where the loss is no number any more."""
+        loss = float(trainer.callback_metrics["loss"])
+        if not loss == loss:
+            raise InputError(
+                f"the loss is not a number at step {trainer.global_step}: lower model.learning_rate "
+                "or set trainer.precision=32-true, then start again from the last checkpoint"
+            )
+        note = f"loss {loss:.4f}"
+        above = trainer.callback_metrics.get("validation/above_baselines_db")
+        if above is not None:
+            note += f", {float(above):+.2f} dB against the best baseline"
+        assert self._bar is not None
+        self._bar.update(self._task, completed=trainer.global_step, note=note)
+
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Close the bar, also after an error."""
+        if self._bar is not None:
+            self._bar.stop()

@@ -1,0 +1,91 @@
+"""A trained model on disk: a diffusers folder with safetensors, and back."""
+
+import json
+import os
+import shutil
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from diffusers import UNet2DConditionModel
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from extrap_train.config import ModelConfig, UNetConfig
+from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.errors import InputError
+
+_PARTS = ("image_encoder", "cc_projection")
+_CONFIG = "extrapolation_model.json"
+
+
+def packaged_weights(name: str) -> Path:
+    """Folder of a model that comes with the package; raises InputError naming those that do."""
+    folder = Path(__file__).parents[1] / "weights"
+    if not (folder / name / _CONFIG).is_file():
+        known = sorted(path.parent.name for path in folder.glob(f"*/{_CONFIG}"))
+        raise InputError(
+            f"model.start={name} is neither a model folder nor one of the package's: {', '.join(known)}"
+        )
+    return folder / name
+
+
+def save_model(model: ExtrapolationModel, folder: Path, dtype: torch.dtype = torch.float32) -> None:
+    """Write `unet/` and `scheduler/` as diffusers does, the other parts as safetensors beside them.
+
+    The folder appears complete or not at all; an older one of that name is replaced.
+    """
+    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir(parents=True)
+    _save_unet(model.unet, temporary / "unet", dtype)
+    model.schedule.save_pretrained(temporary / "scheduler")
+    for part in _PARTS:
+        tensors = getattr(model, part).state_dict()
+        (temporary / part).mkdir()
+        path = temporary / part / "model.safetensors"
+        save_file({k: v.detach().to("cpu", dtype).contiguous() for k, v in tensors.items()}, path)
+    (temporary / _CONFIG).write_text(json.dumps(asdict(model.config), indent=1) + "\n")
+    if folder.exists():
+        shutil.rmtree(folder)
+    temporary.replace(folder)
+
+
+def _save_unet(unet: UNet2DConditionModel, folder: Path, dtype: torch.dtype) -> None:
+    """Through a copy, so that the model that goes on training keeps its precision."""
+    state = {k: v.detach().to("cpu", dtype).contiguous() for k, v in unet.state_dict().items()}
+    unet.save_config(folder)
+    save_file(state, folder / "diffusion_pytorch_model.safetensors", metadata={"format": "pt"})
+
+
+def load_model(folder: Path) -> ExtrapolationModel:
+    """The model of a folder written by `save_model`, in float32; strict."""
+    try:
+        saved = json.loads((folder / _CONFIG).read_text())
+        config = ModelConfig(**{**saved, "unet": UNetConfig(**saved["unet"])})
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise InputError(f"{folder / _CONFIG}: no model of this project ({error})") from None
+    model = ExtrapolationModel(config)
+    load_weights(model, folder)
+    return model
+
+
+def load_weights(model: ExtrapolationModel, folder: Path) -> None:
+    """Fill a model with a folder's weights; names and shapes must be the same."""
+    parts = {part: folder / part / "model.safetensors" for part in _PARTS}
+    parts["unet"] = folder / "unet" / "diffusion_pytorch_model.safetensors"
+    for part, path in parts.items():
+        try:
+            getattr(model, part).load_state_dict(load_file(path))
+        except (OSError, SafetensorError) as error:
+            raise InputError(f"{path}: cannot be read ({error}); restore the model folder") from None
+        except RuntimeError as error:
+            reason = " ".join(str(error).split())[:300]
+            raise InputError(f"{path}: does not fit the configured model: {reason}") from None
+
+
+def start_weights(model: ExtrapolationModel, start: str | None) -> None:
+    """Fill a model with what training starts from: a folder, a packaged model's name, or nothing."""
+    if start is not None:
+        folder = Path(start)
+        load_weights(model, folder if (folder / _CONFIG).is_file() else packaged_weights(start))

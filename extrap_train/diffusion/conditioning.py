@@ -1,0 +1,81 @@
+"""What the denoiser is told about the query view (METHOD section 3; paper II-B).
+
+Input channels, in order: `noisy latent | reference latent | warped-image latent | PE(reference) | PE(warped) | mask`,
+all at the latents' resolution, and one cross-attention token from the reference's embedding and the relative pose.
+"""
+
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+from extrap_train.diffusion.autoencoder import Autoencoder
+from extrap_train.geometry.encoding import coordinate_grid, positional_encoding
+from extrap_train.geometry.fill import fill_holes
+from extrap_train.views import PairBatch, Warp
+
+
+@dataclass(frozen=True)
+class Conditioning:
+    """One query's condition; `zeroed` makes the null condition of classifier-free guidance."""
+
+    latents: Float[Tensor, "b c h w"]
+    """Everything that is concatenated behind the noisy latent."""
+    embedding: Float[Tensor, "b d"]
+    """Reference embedding and pose encoding, before their projection to the token."""
+    base: Float[Tensor, "b z h w"]
+    """Latent that the denoised latent is added to: the filled warp, or zero. No part of the condition."""
+
+    def zeroed(self, where: Bool[Tensor, " b"]) -> Self:
+        """The null condition, the same in training and in sampling, for the chosen examples."""
+        keep = (~where).to(self.latents.dtype)
+        return type(self)(
+            self.latents * keep[:, None, None, None], self.embedding * keep[:, None], self.base
+        )
+
+    def doubled(self) -> Self:
+        """Condition and null condition stacked along the batch, for guidance in one pass."""
+        null = self.zeroed(torch.ones(len(self.latents), dtype=torch.bool, device=self.latents.device))
+        pairs = zip(vars(self).values(), vars(null).values(), strict=True)
+        return type(self)(*(torch.cat(pair) for pair in pairs))
+
+
+def condition_channels(latent_channels: int, octaves: int) -> int:
+    """Channels of `Conditioning.latents`."""
+    return 2 * latent_channels + 2 * 4 * octaves + 1
+
+
+def filled_warp(warp: Warp) -> Float[Tensor, "b 3 h w"]:
+    """The warped image with its holes filled smoothly; mid-grey where nothing at all is known."""
+    return fill_holes(warp.image - 0.5, warp.mask) + 0.5
+
+
+def concatenated_latents(
+    batch: PairBatch, autoencoder: Autoencoder, octaves: int
+) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b z h w"]]:
+    """The channels behind the noisy latent, and the filled warp's latent among them."""
+    if batch.warp is None:
+        raise ValueError("the batch has no warp yet: call `with_warp` first")
+    reference = autoencoder.encode(batch.reference_images[:, 0])
+    warped = autoencoder.encode(filled_warp(batch.warp))
+    height, width = reference.shape[-2:]
+    grid = coordinate_grid(height, width).to(reference).expand(len(reference), -1, -1, -1)
+    channels = [
+        reference,
+        warped,
+        positional_encoding(grid, octaves),
+        _encode_warped(batch.warp, octaves, autoencoder.factor),
+        functional.avg_pool2d(batch.warp.mask[:, None], autoencoder.factor),
+    ]
+    return torch.cat(channels, 1), warped
+
+
+def _encode_warped(warp: Warp, octaves: int, factor: int) -> Float[Tensor, "b c h w"]:
+    """Encoding of the warped coordinates: averaged over each latent's known pixels first, zero in holes."""
+    known = warp.nearest_mask[:, None]
+    share = functional.avg_pool2d(known, factor)
+    coordinates = functional.avg_pool2d(warp.coordinates * known, factor) / share.clamp_min(1e-6)
+    return positional_encoding(coordinates, octaves) * (share > 0)

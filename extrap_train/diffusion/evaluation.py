@@ -1,0 +1,120 @@
+"""Scores of a model and of the baselines on the same held-out examples."""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+
+import pandas as pd
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from extrap_train.config import SamplerConfig
+from extrap_train.diffusion.baselines import inpainted_warp, mean_filled_warp, nearest_reference
+from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.sampler import sample_views, view_generator
+from extrap_train.metrics import psnr, quantised, ssim
+from extrap_train.views import PairBatch
+
+Distance = Callable[[Tensor, Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Every method's image for one batch of held-out queries."""
+
+    batch: PairBatch
+    names: list[str]
+    images: dict[str, Float[Tensor, "b 3 h w"]] = field(default_factory=dict)
+
+
+def baseline_images(batch: PairBatch) -> dict[str, Float[Tensor, "b 3 h w"]]:
+    """The three baselines; the batch must hold its warp."""
+    assert batch.warp is not None
+    return {
+        "nearest": nearest_reference(batch),
+        "inpainted": inpainted_warp(batch.warp),
+        "mean_fill": mean_filled_warp(batch.warp),
+    }
+
+
+def predict(
+    model: ExtrapolationModel,
+    batches: Iterable[tuple[PairBatch, list[str]]],
+    sampler: SamplerConfig,
+    seed: int,
+) -> Iterator[Prediction]:
+    """The model's sample and the baselines for every batch; one seed per view, by its name."""
+    for batch, names in batches:
+        generators = [view_generator(seed, name) for name in names]
+        images = {"model": sample_views(model, batch, sampler, generators), **baseline_images(batch)}
+        yield Prediction(batch, names, images)
+
+
+def score(prediction: Prediction, lpips: Distance | None) -> pd.DataFrame:
+    """A row per view and method: psnr, psnr_holes, psnr_warped (dB), ssim, and lpips where it can be had.
+
+    Images and truth go through 8 bits first. `psnr_holes` is over the pixels that no reference reaches,
+    `psnr_warped` over the others; NaN where a view has none.
+    """
+    assert prediction.batch.warp is not None
+    truth = quantised(prediction.batch.image)
+    known = prediction.batch.warp.mask
+    tables = []
+    for method, image in prediction.images.items():
+        made = quantised(image)
+        columns = {
+            "psnr": psnr(made, truth),
+            "psnr_holes": psnr(made, truth, 1 - known),
+            "psnr_warped": psnr(made, truth, known),
+            "ssim": ssim(made, truth),
+        }
+        if lpips is not None:
+            columns["lpips"] = lpips(made, truth)
+        table = pd.DataFrame({name: values.cpu().double().numpy() for name, values in columns.items()})
+        tables.append(table.assign(method=method, view=prediction.names))
+    return pd.concat(tables, ignore_index=True)
+
+
+def summarise(scores: pd.DataFrame) -> dict[str, dict[str, float]]:
+    """Mean of every metric by method over the views that have it."""
+    means = scores.drop(columns="view").groupby("method", sort=False).mean()
+    return {str(m): {str(k): float(v) for k, v in row.items()} for m, row in means.iterrows()}
+
+
+def better_than_baselines(summary: dict[str, dict[str, float]]) -> float:
+    """How many dB of PSNR the model is above the best baseline."""
+    others = [row["psnr"] for method, row in summary.items() if method != "model"]
+    return summary["model"]["psnr"] - max(others)
+
+
+def first_views(predictions: list[Prediction], count: int) -> Prediction:
+    """`count` views spread evenly over the predictions, as one, for pictures."""
+    total = sum(len(p.names) for p in predictions)
+    chosen = torch.linspace(0, total - 1, min(count, total)).round().long()
+    names = [name for p in predictions for name in p.names]
+    return Prediction(
+        _joined([p.batch for p in predictions], chosen),
+        [names[i] for i in chosen.tolist()],
+        {
+            method: torch.cat([p.images[method] for p in predictions])[chosen]
+            for method in predictions[0].images
+        },
+    )
+
+
+def _joined(batches: list[PairBatch], chosen: Tensor) -> PairBatch:
+    first = batches[0]
+    tensors = {
+        name: torch.cat([getattr(b, name) for b in batches])[chosen]
+        for name, value in vars(first).items()
+        if isinstance(value, Tensor)
+    }
+    assert first.warp is not None
+    warp = replace(
+        first.warp,
+        **{
+            name: torch.cat([getattr(b.warp, name) for b in batches])[chosen]
+            for name in vars(first.warp)
+        },
+    )
+    return replace(first, **tensors, warp=warp)

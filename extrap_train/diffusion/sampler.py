@@ -1,0 +1,65 @@
+"""Sampling a view: DDIM with classifier-free guidance, one generator per view."""
+
+import copy
+import zlib
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from extrap_train.config import SamplerConfig
+from extrap_train.diffusion.conditioning import Conditioning
+from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.views import PairBatch
+
+
+def view_generator(seed: int, name: str) -> torch.Generator:
+    """The generator of one view: the same noise for the same view, whatever batch it is sampled in."""
+    return torch.Generator().manual_seed(seed * 2**32 + zlib.crc32(name.encode()))
+
+
+@torch.no_grad()
+def sample_views(
+    model: ExtrapolationModel,
+    batch: PairBatch,
+    config: SamplerConfig,
+    generators: Sequence[torch.Generator],
+) -> Float[Tensor, "b 3 h w"]:
+    """Images of the batch's queries in [0, 1]; the batch must hold its warp.
+
+    Noise is drawn on the CPU, one generator a view, so that the device does not change the picture.
+    """
+    conditioning = model.condition(batch)
+    schedule = copy.deepcopy(model.schedule)
+    schedule.set_timesteps(config.steps)
+    latent = _noise(conditioning.base, generators)
+    for timestep in schedule.timesteps:
+        prediction = _guided(model, latent, int(timestep), conditioning, config.guidance)
+        noise = _noise(latent, generators) if config.eta > 0 else None
+        latent = schedule.step(
+            prediction, timestep, latent, eta=config.eta, variance_noise=noise
+        ).prev_sample
+    return model.decode_target(latent, conditioning)
+
+
+def _noise(
+    like: Float[Tensor, "b c h w"], generators: Sequence[torch.Generator]
+) -> Float[Tensor, "b c h w"]:
+    return torch.stack([torch.randn(like.shape[1:], generator=g) for g in generators]).to(like)
+
+
+def _guided(
+    model: ExtrapolationModel,
+    latent: Float[Tensor, "b z h w"],
+    timestep: int,
+    conditioning: Conditioning,
+    guidance: float,
+) -> Float[Tensor, "b z h w"]:
+    if guidance == 1:
+        steps = torch.full((len(latent),), timestep, device=latent.device)
+        return model(latent, steps, conditioning)
+    steps = torch.full((2 * len(latent),), timestep, device=latent.device)
+    both = model(torch.cat([latent, latent]), steps, conditioning.doubled())
+    conditional, null = both.chunk(2)
+    return null + guidance * (conditional - null)

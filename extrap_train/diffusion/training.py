@@ -1,0 +1,117 @@
+"""The training loop's mathematics and its optimiser, as a LightningModule."""
+
+import lightning
+import pandas as pd
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from extrap_train.config import TrainConfig
+from extrap_train.data.module import with_warp
+from extrap_train.diffusion.evaluation import (
+    Distance,
+    Prediction,
+    better_than_baselines,
+    first_views,
+    predict,
+    score,
+    summarise,
+)
+from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.views import PairBatch
+
+
+def diffusion_loss(
+    model: ExtrapolationModel,
+    batch: PairBatch,
+    generator: torch.Generator,
+    condition_dropout: float,
+) -> Float[Tensor, ""]:
+    """Mean squared error of the prediction at one random noise level per example.
+
+    Every random number comes from the (CPU) generator, so that a step is a function of its seed alone.
+    """
+    conditioning = model.condition(batch)
+    target = model.encode_target(batch.image, conditioning)
+    count = len(target)
+    dropped = torch.rand(count, generator=generator) < condition_dropout
+    steps = model.schedule.config["num_train_timesteps"]
+    timestep = torch.randint(0, steps, (count,), generator=generator).to(target.device)
+    noise = torch.randn(target.shape, generator=generator).to(target)
+    noisy = model.schedule.add_noise(target, noise, timestep)
+    conditioning = conditioning.zeroed(dropped.to(target.device))
+    prediction = model(noisy, timestep, conditioning)
+    wanted = {
+        "epsilon": lambda: noise,
+        "sample": lambda: target,
+        "v_prediction": lambda: model.schedule.get_velocity(target, noise, timestep),
+    }[model.config.prediction]()
+    return functional.mse_loss(prediction, wanted)
+
+
+class CategoryTraining(lightning.LightningModule):
+    """Trains an ExtrapolationModel; validation samples held-out views and scores them."""
+
+    def __init__(
+        self,
+        model: ExtrapolationModel,
+        config: TrainConfig,
+        validation_names: list[list[str]],
+        lpips: Distance | None,
+    ) -> None:
+        super().__init__()
+        self.model = model
+        self.config = config
+        self.validation_names = validation_names
+        self.distance = lpips
+        self.predictions: list[Prediction] = []
+
+    def training_step(self, batch: PairBatch, batch_idx: int) -> Tensor:
+        """One step; its noise is a function of seed, step and rank."""
+        generator = torch.Generator().manual_seed(
+            (self.config.seed * 2**20 + self.global_step) * 64 + self.global_rank
+        )
+        loss = diffusion_loss(
+            self.model, batch, generator, self.config.trainer.condition_dropout
+        )
+        self.log("loss", loss, prog_bar=True)
+        return loss
+
+    def validation_step(self, batch: PairBatch, batch_idx: int) -> None:
+        """Sample the batch's queries."""
+        named = [(with_warp(batch), self.validation_names[batch_idx])]
+        self.predictions += predict(self.model, named, self.config.sampler, self.config.seed)
+
+    def on_validation_epoch_start(self) -> None:
+        """Forget the last validation's pictures."""
+        self.predictions = []
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the means."""
+        summary = summarise(self.scores())
+        self.log_dict({f"validation/{name}": value for name, value in summary["model"].items()})
+        self.log("validation/above_baselines_db", better_than_baselines(summary), prog_bar=True)
+
+    def scores(self) -> pd.DataFrame:
+        """Scores of the last validation, a row per view and method."""
+        return pd.concat([score(p, self.distance) for p in self.predictions], ignore_index=True)
+
+    def pictures(self) -> Prediction:
+        """The views of the last validation that are shown."""
+        return first_views(self.predictions, self.config.validation.pictures)
+
+    def configure_optimizers(self) -> dict[str, object]:
+        """AdamW with a linear warm-up to a constant rate, as MegaScenes trains."""
+        model, trainer = self.config.model, self.config.trainer
+        optimizer = torch.optim.AdamW(
+            self.model.parameters(),
+            lr=model.learning_rate,
+            weight_decay=model.weight_decay,
+            betas=(0.9, 0.99),
+            fused=True,
+        )
+        warmup = torch.optim.lr_scheduler.LambdaLR(
+            optimizer, lambda step: min(1.0, (step + 1) / max(1, trainer.warmup_steps))
+        )
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": warmup, "interval": "step"}}

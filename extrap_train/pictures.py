@@ -1,0 +1,86 @@
+"""Contact sheets: what a person looks at beside the numbers."""
+
+import io
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image, ImageDraw
+from torch import Tensor
+
+from extrap_train.data.files import write_whole
+
+_HOLE_COLOUR = (1.0, 0.0, 1.0)
+_LEAST_TILE_PIXELS = 128
+
+
+def colour_depth(depth: Float[Tensor, "b h w"]) -> Float[Tensor, "b 3 h w"]:
+    """Near is yellow, far is blue, unknown is black; each picture over its own 2–98 % range."""
+    pictures = []
+    for one in depth:
+        known = one > 0
+        low, high = one[known].quantile(torch.tensor([0.02, 0.98]).to(one)) if known.any() else (0, 1)
+        near = 1 - ((one - low) / max(float(high - low), 1e-12)).clamp(0, 1)
+        colours = torch.from_numpy(plt.get_cmap("viridis")(near.cpu().numpy())[..., :3])
+        pictures.append(torch.where(known[..., None].cpu(), colours, 0.0).permute(2, 0, 1).float())
+    return torch.stack(pictures)
+
+
+def mark_holes(
+    image: Float[Tensor, "b 3 h w"], mask: Float[Tensor, "b h w"]
+) -> Float[Tensor, "b 3 h w"]:
+    """Holes in magenta, a colour that no photograph has by accident."""
+    return torch.where(mask[:, None] > 0, image, image.new_tensor(_HOLE_COLOUR)[:, None, None])
+
+
+def error_map(
+    image: Float[Tensor, "b 3 h w"], truth: Float[Tensor, "b 3 h w"]
+) -> Float[Tensor, "b 3 h w"]:
+    """Mean absolute colour difference, black to white over [0, ½]."""
+    error = (image - truth).abs().mean(1, keepdim=True)
+    return (2 * error).clamp(0, 1).expand(-1, 3, -1, -1)
+
+
+def contact_sheet(columns: dict[str, Float[Tensor, "b 3 h w"]], path: Path) -> None:
+    """A row per example and a titled column per kind of picture, written as PNG."""
+    titles = list(columns)
+    pictures = [columns[title].detach().float().cpu().clamp(0, 1) for title in titles]
+    rows, height, width = len(pictures[0]), *pictures[0].shape[-2:]
+    scale = max(1, round(_LEAST_TILE_PIXELS / width))
+    tile_height, tile_width = height * scale, width * scale
+    strip, gap = 20, 4
+    sheet = np.full(
+        (strip + rows * (tile_height + gap), len(titles) * (tile_width + gap), 3), 255, np.uint8
+    )
+    for column, picture in enumerate(pictures):
+        pixels = (picture * 255).round().byte().permute(0, 2, 3, 1).numpy()
+        for row, tile in enumerate(pixels.repeat(scale, 1).repeat(scale, 2)):
+            top, left = strip + row * (tile_height + gap), column * (tile_width + gap)
+            sheet[top : top + tile_height, left : left + tile_width] = tile
+    write_whole(path, _titled(sheet, titles, tile_width + gap))
+
+
+def _titled(sheet: np.ndarray, titles: list[str], pitch: int) -> bytes:
+    picture = Image.fromarray(sheet)
+    draw = ImageDraw.Draw(picture)
+    for column, title in enumerate(titles):
+        draw.text((column * pitch + 4, 4), title, fill=(0, 0, 0))
+    content = io.BytesIO()
+    picture.save(content, "png")
+    return content.getvalue()
+
+
+def curve(steps: list[int], series: dict[str, list[float]], label: str, path: Path) -> None:
+    """Line plot over training steps, written as PNG."""
+    figure, axes = plt.subplots(figsize=(6, 4), layout="constrained")
+    for name, values in series.items():
+        axes.plot(steps, values, marker="o", markersize=3, label=name)
+    axes.set_xlabel("training steps")
+    axes.set_ylabel(label)
+    axes.legend()
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=100)
+    plt.close(figure)
+    write_whole(path, content.getvalue())

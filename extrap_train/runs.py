@@ -1,0 +1,121 @@
+"""The folder of a training run: its name, what it was started with, and whether it may be resumed."""
+
+import hashlib
+import json
+import os
+import platform
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+
+from extrap_train.config import TrainConfig, dotted
+from extrap_train.data.files import write_whole
+from extrap_train.errors import InputError
+
+_NOT_PART_OF_THE_RUN = ("output", "run", "resume", "threads", "validation", "data.root", "trainer.steps")
+"""Keys that may differ on resume: where things lie, how they are measured, and a longer training."""
+
+_PACKAGES = ("torch", "lightning", "diffusers", "numba", "numpy", "extrap-train")
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Where a run keeps what it makes."""
+
+    path: Path
+
+    @property
+    def checkpoints(self) -> Path:
+        """Complete checkpoints, named by their step."""
+        return self.path / "checkpoints"
+
+    @property
+    def samples(self) -> Path:
+        """Picture sheets, one a validation."""
+        return self.path / "samples"
+
+    @property
+    def model(self) -> Path:
+        """The trained model as a diffusers folder."""
+        return self.path / "model"
+
+    @property
+    def summary(self) -> Path:
+        """The result; a run that has it for the wanted number of steps is finished."""
+        return self.path / "summary.json"
+
+
+def run_identity(config: TrainConfig) -> dict[str, Any]:
+    """The options that make a run what it is, by dotted key."""
+    return {
+        key: value
+        for key, value in dotted(asdict(config)).items()
+        if not any(key == name or key.startswith(f"{name}.") for name in _NOT_PART_OF_THE_RUN)
+    }
+
+
+def open_run(config: TrainConfig) -> RunFolder:
+    """Make or find the run's folder, write its configuration, and point `latest` at it.
+
+    Raises InputError where a run of that name was started with other options and is to be resumed.
+    """
+    identity = run_identity(config)
+    digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:8]
+    name = config.run or f"seed{config.seed}-{digest}"
+    path = Path(config.output) / "train" / config.category.name / config.model.name / name
+    saved = path / "config.yaml"
+    if saved.is_file() and config.resume:
+        _check_same(saved, identity)
+    write_whole(saved, yaml.safe_dump(asdict(config), sort_keys=False).encode())
+    _point(path.parent / "latest", name)
+    return RunFolder(path)
+
+
+def _check_same(saved: Path, identity: dict[str, Any]) -> None:
+    try:
+        before = dotted(yaml.safe_load(saved.read_text()))
+    except (yaml.YAMLError, AttributeError) as error:
+        raise InputError(f"{saved}: unreadable ({error}); remove the run or choose run=NAME") from None
+    changed = [
+        f"{key} (was {before.get(key)}, now {value})"
+        for key, value in identity.items()
+        if before.get(key) != value
+    ]
+    if changed:
+        raise InputError(
+            f"{saved.parent}: started with other options: {', '.join(changed)}; "
+            "give them back their values, or choose another run=NAME, or resume=false to start over"
+        )
+
+
+def _point(link: Path, target: str) -> None:
+    temporary = link.with_name(f".latest.{os.getpid()}")
+    temporary.unlink(missing_ok=True)
+    temporary.symlink_to(target)
+    temporary.replace(link)
+
+
+def provenance(config: TrainConfig, data_hashes: dict[str, str]) -> dict[str, Any]:
+    """What a result was made with: configuration, data, seed, device and versions."""
+    identity = json.dumps(run_identity(config), sort_keys=True)
+    return {
+        "config": hashlib.sha256(identity.encode()).hexdigest(),
+        "data": data_hashes,
+        "seed": config.seed,
+        "start": config.model.start,
+        "device": torch.cuda.get_device_name() if torch.cuda.is_available() else platform.machine(),
+        "threads": torch.get_num_threads(),
+        "python": platform.python_version(),
+        "versions": {name: _version(name) for name in _PACKAGES},
+    }
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None

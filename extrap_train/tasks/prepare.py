@@ -1,0 +1,65 @@
+"""From a category's name to prepared pairs: synthesis where the data is synthetic, then reading and preparation."""
+
+import hashlib
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+from data_prep.build import prepare
+from data_prep.synthesize import synthesize
+from extrap_train.config import (
+    Co3dConfig,
+    DataConfig,
+    DepthConfig,
+    PrepConfig,
+    SyntheticConfig,
+)
+from extrap_train.data.co3d import read_category
+from extrap_train.data.sequences import Sequence
+from extrap_train.data.store import PreparedData
+from extrap_train.depth.build import depth_source
+
+
+def prepare_category(
+    category: str,
+    data: DataConfig,
+    depth: DepthConfig,
+    prep: PrepConfig,
+    *,
+    output: Path,
+    workers: int,
+    seed: int,
+) -> PreparedData:
+    """Sequences of one category as pairs on disk; what is there already is used again."""
+    sequences, test_names = _sequences(category, data, output, workers)
+    folder = output / "data" / f"{category}-{_digest(category, data, depth, prep, seed)}"
+    return prepare(
+        sequences,
+        depth_source(depth),
+        prep,
+        test_names=test_names,
+        folder=folder,
+        workers=workers,
+        seed=seed,
+    )
+
+
+def _sequences(
+    category: str, data: DataConfig, output: Path, workers: int
+) -> tuple[list[Sequence], set[str] | int]:
+    if isinstance(data, SyntheticConfig):
+        root = Path(data.root) if data.root else output / "synthetic"
+        synthesize(data, category, root, workers)
+        wanted = {f"{i:04d}" for i in range(data.test_sequences + data.train_sequences)}
+        sequences = [s for s in read_category(root, category) if s.name in wanted]
+        return sequences, {f"{i:04d}" for i in range(data.test_sequences)}
+    assert isinstance(data, Co3dConfig)
+    assert data.root is not None
+    return read_category(Path(data.root), category), data.test_sequences
+
+
+def _digest(
+    category: str, data: DataConfig, depth: DepthConfig, prep: PrepConfig, seed: int
+) -> str:
+    parts = [category, asdict(data), asdict(depth), asdict(prep), seed]
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:8]
