@@ -56,7 +56,7 @@ def write_sequence(
     points: Float[Tensor, "n 3"],
     colors: Float[Tensor, "n 3"],
 ) -> dict[str, Any]:
-    """Write a point cloud (colours in [0, 1]); returns the sequence's entry for `write_annotations`."""
+    """Write the point cloud, colours in [0, 1]; returns the entry for `write_annotations`."""
     path = f"{category}/{sequence_name}/pointcloud.ply"
     write_whole(root / path, _ply(points, colors))
     return {

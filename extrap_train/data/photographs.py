@@ -1,0 +1,171 @@
+"""Posed photographs in a folder, whatever lists them: paths, lenses and poses to a sequence."""
+
+import logging
+from collections.abc import Sequence as List
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from extrap_train.data.files import resolve_inside
+from extrap_train.data.images import known_depth, read_image, read_mask, read_sixteen_bit
+from extrap_train.data.sequences import Frame, Sequence
+from extrap_train.data.validation import require_sound
+from extrap_train.errors import InputError
+from extrap_train.geometry.lens import Lens, undistort
+from extrap_train.views import Camera, View, stack_cameras
+
+CATEGORY = "scene"
+"""What stands for a category where a capture has none."""
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """What a description says of one picture; paths are relative to the capture's folder."""
+
+    image_path: str
+    height: int
+    width: int
+    lens: Lens
+    world_to_cam: Float[Tensor, "4 4"]
+    depth_path: str | None = None
+    depth_scale: float = 1.0
+    """Scene units per unit of the depth file."""
+    mask_path: str | None = None
+
+
+@dataclass(frozen=True)
+class _Loader:
+    """Reads one photograph and undoes its lens; a dataclass, so that workers can be sent it."""
+
+    root: Path
+    photograph: Photograph
+    pinhole: Lens
+    camera: Camera
+    name: str
+
+    def load(self) -> View:
+        photo, size = self.photograph, (self.camera.height, self.camera.width)
+        image = read_image(resolve_inside(self.root, photo.image_path), size)
+        depth = _read_depth(self.root, photo) if photo.depth_path else None
+        mask_path = photo.mask_path and resolve_inside(self.root, photo.mask_path)
+        mask = read_mask(mask_path, size) if mask_path else None
+        return View(
+            image=self._straight(image.permute(1, 2, 0)).permute(2, 0, 1).contiguous(),
+            camera=self.camera,
+            depth=None if depth is None else self._straight(depth, nearest=True),
+            mask=None if mask is None else self._straight(mask),
+            name=self.name,
+        )
+
+    def _straight(self, picture: Tensor, nearest: bool = False) -> Tensor:
+        lens = self.photograph.lens
+        if lens.is_pinhole:
+            return picture
+        return torch.from_numpy(undistort(picture.numpy(), lens, self.pinhole, nearest))
+
+
+def present_pictures(root: Path, paths: List[str], description: Path) -> set[str]:
+    """Those of `paths` that exist below `root`; the missing are named in one warning.
+
+    `description` is the file that lists them. Raises InputError where none exists.
+    """
+    present = {path for path in paths if (root / path).is_file()}
+    missing = sorted(set(paths) - present)
+    if not present:
+        raise InputError(
+            f"{description}: none of the {len(paths)} pictures it lists is in {root}; "
+            "put the pictures there"
+        )
+    if missing:
+        log.warning(
+            "%s: %d of %d entries have no picture and are left out: %s",
+            description,
+            len(missing),
+            len(paths),
+            ", ".join(missing[:3]) + (", …" if len(missing) > 3 else ""),
+        )
+    return present
+
+
+def sequence_of_photographs(
+    root: Path,
+    name: str,
+    photographs: List[Photograph],
+    description: Path,
+    point_cloud: Path | None = None,
+) -> Sequence:
+    """A sequence of photographs in the order of their paths.
+
+    `description` is the file that lists them. Raises InputError where a picture is listed
+    twice, a camera is degenerate or a lens cannot be undone.
+    """
+    ordered = sorted(photographs, key=lambda photo: photo.image_path)
+    paths = [photo.image_path for photo in ordered]
+    if len(set(paths)) != len(paths):
+        raise InputError(f"{description}: lists a picture twice; remove the second entry")
+    frames = []
+    for photo, frame_name in zip(ordered, _frame_names(paths), strict=True):
+        pinhole, camera = _pinhole_camera(photo, description)
+        frames.append(
+            Frame(
+                name=frame_name,
+                camera=camera,
+                has_depth=photo.depth_path is not None,
+                has_mask=photo.mask_path is not None,
+                load=_Loader(root, photo, pinhole, camera, frame_name).load,
+            )
+        )
+    return Sequence(CATEGORY, name, tuple(frames), point_cloud=point_cloud)
+
+
+def _frame_names(paths: list[str]) -> list[str]:
+    """File names where these are unique, else whole paths with the folders joined by `_`."""
+    names = [Path(path).name for path in paths]
+    if len(set(names)) == len(names):
+        return names
+    return ["_".join(Path(path).parts) for path in paths]
+
+
+def _pinhole_camera(photo: Photograph, description: Path) -> tuple[Lens, Camera]:
+    if not all(np.isfinite([*photo.lens.matrix.flat, *photo.lens.distortion])):
+        raise InputError(f"{description}: the lens of {photo.image_path} is not finite; correct it")
+    try:
+        pinhole = photo.lens.pinhole(photo.height, photo.width)
+    except ValueError as error:
+        raise InputError(
+            f"{description}: {photo.image_path}: {error}; correct the lens or undistort beforehand"
+        ) from None
+    camera = Camera(
+        photo.world_to_cam.float(),
+        torch.from_numpy(pinhole.matrix).float(),
+        photo.height,
+        photo.width,
+    )
+    require_sound(stack_cameras([camera]), [photo.image_path], description)
+    return pinhole, camera
+
+
+def _read_depth(root: Path, photo: Photograph) -> Float[Tensor, "h w"]:
+    path = resolve_inside(root, photo.depth_path or "")
+    size = (photo.height, photo.width)
+    raw = _read_npy(path, size) if path.suffix == ".npy" else read_sixteen_bit(path, size)
+    return known_depth(raw, photo.depth_scale, path)
+
+
+def _read_npy(path: Path, size: tuple[int, int]) -> np.ndarray:
+    try:
+        # Mapped, not read: the header may promise any size.
+        raw = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(f"{path}: is no array of numbers ({error}); restore it") from None
+    if raw.shape != size or raw.dtype.kind not in "fiu":
+        raise InputError(
+            f"{path}: is an array of {raw.dtype} {raw.shape}, expected numbers {size}; restore it"
+        )
+    return np.array(raw)

@@ -1,0 +1,125 @@
+"""Folders with a `transforms.json`, as nerfstudio and instant-ngp write them (OpenGL axes)."""
+
+import math
+import posixpath
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from extrap_train.data.files import check_relative, read_json
+from extrap_train.data.images import image_size
+from extrap_train.data.photographs import Photograph, present_pictures, sequence_of_photographs
+from extrap_train.data.sequences import Sequence
+from extrap_train.data.validation import require_dict, require_list
+from extrap_train.errors import InputError
+from extrap_train.geometry.colmap import CAMERA_MODELS, lens_from_parameters
+from extrap_train.geometry.lens import Lens
+from extrap_train.geometry.opengl import world_to_cam_from_opengl
+
+TRANSFORMS = "transforms.json"
+MILLIMETRES = 0.001
+"""nerfstudio's unit of depth files, in scene units."""
+
+_FISHEYE = {model.name: model.fisheye for model in CAMERA_MODELS} | {"PERSPECTIVE": False}
+_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+
+
+def read_transforms(folder: Path) -> Sequence:
+    """The capture in a folder with a `transforms.json`; distortion is undone when a frame is read.
+
+    Size, intrinsics and distortion may stand for a frame alone or for all. The world is the file's,
+    whatever `applied_transform` led to it; depth is scaled along with `applied_scale`. Entries
+    without a picture are left out with one warning.
+    """
+    file = folder / TRANSFORMS
+    content = require_dict(read_json(file), "an object with a list `frames`", file)
+    entries = require_list(content.get("frames"), "frames", file)
+    paths = [_picture_path(folder, entry, index, file) for index, entry in enumerate(entries)]
+    present = present_pictures(folder, paths, file)
+    cloud = content.get("ply_file_path")
+    return sequence_of_photographs(
+        folder,
+        folder.resolve().name,
+        [
+            _photograph(folder, path, content | entry, file)
+            for path, entry in zip(paths, entries, strict=True)
+            if path in present
+        ],
+        file,
+        point_cloud=folder / check_relative(str(cloud), file) if cloud else None,
+    )
+
+
+def _picture_path(folder: Path, entry: Any, index: int, file: Path) -> str:
+    what = f"an object with a text `file_path` as frame {index}"
+    path = require_dict(entry, what, file).get("file_path")
+    if not isinstance(path, str):
+        raise InputError(f"{file}: expected {what}; correct the entry")
+    path = posixpath.normpath(check_relative(path, file))
+    # Blender's scenes leave the suffix out.
+    return path if Path(path).suffix or (folder / path).is_file() else f"{path}.png"
+
+
+def _photograph(folder: Path, path: str, entry: dict[str, Any], file: Path) -> Photograph:
+    try:
+        height, width = _size(folder / path, entry)
+        return Photograph(
+            image_path=path,
+            height=height,
+            width=width,
+            lens=_lens(entry, height, width),
+            world_to_cam=world_to_cam_from_opengl(_matrix(entry["transform_matrix"])),
+            depth_path=_optional_path(entry.get("depth_file_path"), file),
+            depth_scale=float(entry.get("depth_unit_scale_factor", MILLIMETRES))
+            * float(entry.get("applied_scale", 1.0)),
+            mask_path=_optional_path(entry.get("mask_path"), file),
+        )
+    except KeyError as error:
+        raise InputError(
+            f"{file}: neither the file nor its entry {path} has {error}; add it"
+        ) from None
+    except InputError:
+        raise
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{file}: entry {path} is malformed ({error}); correct it") from None
+
+
+def _size(picture: Path, entry: dict[str, Any]) -> tuple[int, int]:
+    if "h" not in entry and "w" not in entry:
+        return image_size(picture)
+    height, width = int(entry["h"]), int(entry["w"])
+    if height <= 0 or width <= 0:
+        raise ValueError(f"image size {height} x {width}")
+    return height, width
+
+
+def _lens(entry: dict[str, Any], height: int, width: int) -> Lens:
+    model = entry.get("camera_model", "PERSPECTIVE")
+    if model not in _FISHEYE:
+        raise ValueError(f"camera model {model!r} is none of {', '.join(_FISHEYE)}")
+    if "fl_x" in entry:
+        focal = float(entry["fl_x"])
+    else:
+        focal = width / 2 / math.tan(float(entry["camera_angle_x"]) / 2)
+    values = {
+        "fx": focal,
+        "fy": float(entry.get("fl_y", focal)),
+        "cx": float(entry.get("cx", width / 2)),
+        "cy": float(entry.get("cy", height / 2)),
+    }
+    distortion = {name: float(entry[name]) for name in _COEFFICIENTS if name in entry}
+    return lens_from_parameters(values | distortion, _FISHEYE[model])
+
+
+def _matrix(rows: Any) -> Float[Tensor, "4 4"]:
+    matrix = torch.tensor(rows, dtype=torch.float64)
+    if matrix.shape not in ((4, 4), (3, 4)):
+        raise ValueError(f"transform_matrix has shape {tuple(matrix.shape)}, expected 4 x 4")
+    return torch.cat([matrix[:3], matrix.new_tensor([[0, 0, 0, 1]])])
+
+
+def _optional_path(path: Any, file: Path) -> str | None:
+    return check_relative(str(path), file) if path else None
