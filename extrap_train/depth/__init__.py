@@ -5,12 +5,17 @@ A source is added with one file here and one YAML under `conf/depth/`.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from extrap_train.geometry.cameras import transform, unproject
 from extrap_train.views import View
+
+RELIABLE_CONFIDENCE = 0.3
+"""From here on a depth is used: most of what lies below is wrong, most of what lies above is right."""
 
 
 @dataclass(frozen=True)
@@ -31,9 +36,33 @@ class DepthMap:
     depth: Float[Tensor, "h w"]
     confidence: Float[Tensor, "h w"]
 
+    def reliable(self, least_confidence: float = RELIABLE_CONFIDENCE) -> Float[Tensor, "h w"]:
+        """Depth, and 0 (unknown) where the confidence is lower."""
+        return torch.where(self.confidence >= least_confidence, self.depth, 0)
 
+
+def point_maps_of(
+    first: View, first_map: DepthMap, second: View, second_map: DepthMap
+) -> PointMaps:
+    """The points that two depth maps stand for."""
+    second_to_first = first.camera.world_to_cam @ second.camera.cam_to_world
+    points = unproject(second_map.depth, second.camera)
+    return PointMaps(
+        first=unproject(first_map.depth, first.camera),
+        second=transform(second_to_first, points.flatten(0, 1)).view_as(points),
+        first_confidence=first_map.confidence,
+        second_confidence=second_map.confidence,
+    )
+
+
+@runtime_checkable
 class DepthSource(Protocol):
     """Geometry from posed views."""
+
+    @property
+    def image_size(self) -> int | None:
+        """Longer side that depth is estimated at, in pixels; None where it comes with the data."""
+        ...
 
     def point_maps(self, first: View, second: View) -> PointMaps:
         """Both views' point maps, from these two views alone."""
@@ -41,4 +70,8 @@ class DepthSource(Protocol):
 
     def depth_map(self, view: View, neighbours: Sequence[View]) -> DepthMap:
         """One view's depth, with the help of others that see the same surface."""
+        ...
+
+    def depth_maps(self, views: Sequence[View]) -> list[DepthMap]:
+        """The depth of every view of one sequence; each finds its neighbours among the others."""
         ...

@@ -1,0 +1,42 @@
+"""The depth that views bring along: CO3D's, or the exact depth of rendered ones."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+from extrap_train.depth import DepthMap, PointMaps, point_maps_of
+from extrap_train.errors import InputError
+from extrap_train.views import View
+
+
+@dataclass(frozen=True)
+class DatasetDepth:
+    """Confidence is 1 where depth is known, else 0."""
+
+    @property
+    def image_size(self) -> None:
+        """None: depth comes at the size of the photographs."""
+
+    def depth_map(self, view: View, neighbours: Sequence[View]) -> DepthMap:
+        """The view's own depth; the neighbours are not looked at. InputError if it has none."""
+        depth = _depth(view)
+        return DepthMap(depth, (depth > 0).to(depth.dtype))
+
+    def depth_maps(self, views: Sequence[View]) -> list[DepthMap]:
+        """Every view's own depth."""
+        return [self.depth_map(view, ()) for view in views]
+
+    def point_maps(self, first: View, second: View) -> PointMaps:
+        """Both views' points in the first camera's frame."""
+        one, two = self.depth_map(first, ()), self.depth_map(second, ())
+        return point_maps_of(first, one, second, two)
+
+
+def _depth(view: View) -> Float[Tensor, "h w"]:
+    if view.depth is None:
+        raise InputError(
+            f"{view.name or 'a view'}: has no depth; use depth=stereo, which estimates it from the photographs"
+        )
+    return view.depth

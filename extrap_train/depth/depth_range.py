@@ -1,0 +1,61 @@
+"""Which depths a view can have, from the cameras alone."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from extrap_train.depth.photo_cost import Projection
+from extrap_train.views import Camera
+
+NEAREST, FARTHEST = 0.3, 20.0
+"""Range of depths, as multiples of the scene centre's depth."""
+WIDEST_DISPARITY = 0.25
+"""Of cameras that look the same way: the largest displacement, as a share of the image's longer side."""
+LEAST_SEEN = 0.1
+"""A depth at which fewer of a view's pixels are seen by a neighbour cannot be told, and is not tried."""
+LEAST_CONVERGENCE_RAD = 0.05
+
+
+def scene_center(cameras: list[Camera]) -> Float[Tensor, "3"] | None:
+    """The point nearest to all optical axes, by least squares; None if the cameras look the same way."""
+    centers = torch.stack([camera.center for camera in cameras]).double()
+    axes = torch.stack([camera.forward for camera in cameras]).double()
+    if float(torch.acos((axes @ axes.mT).clamp(-1, 1)).max()) < LEAST_CONVERGENCE_RAD:
+        return None
+    across = torch.eye(3).to(axes) - axes[:, :, None] * axes[:, None, :]
+    normal_matrix, moment = across.sum(0), (across @ centers[:, :, None]).sum(0)
+    return torch.linalg.solve(normal_matrix, moment)[:, 0].float()
+
+
+def inverse_depth_range(
+    camera: Camera, neighbours: list[Camera], center: Float[Tensor, "3"] | None
+) -> tuple[float, float]:
+    """Least and greatest inverse depth that a pixel of `camera` may have, in 1 / scene unit.
+
+    Around the scene's centre; for cameras that look the same way, or away from it, from infinity to where
+    the displacement between the images becomes too large. Depths that no neighbour sees are cut off.
+    """
+    center_depth = 0.0
+    if center is not None:
+        center_depth = float(camera.world_to_cam[2, :3] @ center + camera.world_to_cam[2, 3])
+    if center_depth > 0:
+        least, greatest = 1 / (FARTHEST * center_depth), 1 / (NEAREST * center_depth)
+    else:
+        baseline = max(float((other.center - camera.center).norm()) for other in neighbours)
+        longer = max(camera.height, camera.width)
+        greatest = WIDEST_DISPARITY * longer / (float(camera.intrinsics[0, 0]) * baseline)
+        least = greatest / 100
+    return _seen(camera, neighbours, torch.linspace(least, greatest, 200))
+
+
+def _seen(
+    camera: Camera, neighbours: list[Camera], candidates: Float[Tensor, "d"]
+) -> tuple[float, float]:
+    small = camera.resized(16, 16)
+    inverse_depth = candidates.to(camera.intrinsics)[:, None, None].expand(-1, 16, 16)
+    seen = [Projection.between(small, other).normalised(inverse_depth)[1] for other in neighbours]
+    share = torch.stack(seen).any(0).float().mean((-2, -1))
+    used = candidates[share.cpu() >= LEAST_SEEN]
+    if not len(used):
+        return float(candidates[0]), float(candidates[-1])
+    return float(used[0]), float(used[-1])

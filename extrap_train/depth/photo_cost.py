@@ -1,0 +1,125 @@
+"""How alike views look at hypothetical depths: the matching cost of plane-sweep stereo."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+from extrap_train.geometry.cameras import pixel_grid
+from extrap_train.views import Camera, View
+
+WINDOW = 5
+"""Side of the window that is compared, in pixels."""
+NOISE_VARIANCE = 2e-5
+"""Variance of colour that counts as noise: a window with no more than that looks like any other."""
+CHUNK_ELEMENTS = 4_000_000
+"""Most colour samples that are held at a time."""
+
+
+@dataclass(frozen=True)
+class Projection:
+    """Pixels of one view to pixels of another, as a function of inverse depth.
+
+    A pixel p of inverse depth w lands at the homogeneous point A·p + w·e; e is the epipole.
+    """
+
+    at_infinity: Float[Tensor, "h w 3"]
+    epipole: Float[Tensor, "3"]
+    height: int
+    width: int
+
+    @classmethod
+    def between(
+        cls, source: Camera, target: Camera, pixels: Float[Tensor, "h w 2"] | None = None
+    ) -> Self:
+        """From `pixels` of `source`, by default its pixel centres, to pixels of `target`."""
+        source_to_target = target.world_to_cam @ source.cam_to_world
+        homography = (
+            target.intrinsics @ source_to_target[:3, :3] @ torch.linalg.inv(source.intrinsics)
+        )
+        if pixels is None:
+            pixels = pixel_grid(source.height, source.width, homography.device)
+        epipole = target.intrinsics @ source_to_target[:3, 3]
+        homogeneous = functional.pad(pixels, (0, 1), value=1.0)
+        return cls(homogeneous @ homography.mT, epipole, target.height, target.width)
+
+    def points(
+        self, inverse_depth: Float[Tensor, "*d h w"]
+    ) -> tuple[Float[Tensor, "*d h w 2"], Float[Tensor, "*d h w"]]:
+        """Pixels (u, v), and depth in the target as a multiple of depth in the source."""
+        homogeneous = self.at_infinity + inverse_depth[..., None] * self.epipole
+        scale = homogeneous[..., 2]
+        return homogeneous[..., :2] / scale.clamp_min(1e-6)[..., None], scale
+
+    def normalised(
+        self, inverse_depth: Float[Tensor, "*d h w"]
+    ) -> tuple[Float[Tensor, "*d h w 2"], Bool[Tensor, "*d h w"]]:
+        """Normalised coordinates in the target, and whether they lie inside it, in front of it."""
+        pixels, scale = self.points(inverse_depth)
+        size = pixels.new_tensor([self.width, self.height])
+        inside = ((pixels >= 0) & (pixels <= size)).all(-1) & (scale > 1e-6)
+        return pixels / size * 2 - 1, inside
+
+
+class PhotoCost:
+    """Cost of depth hypotheses of one view against its neighbours.
+
+    1 − zero-mean normalised cross-correlation of colour windows (which exposure does not change), halved
+    to [0, 1], averaged over the better half of the neighbours that see the point: an occluded one disagrees.
+    """
+
+    def __init__(self, view: View, neighbours: list[View]) -> None:
+        self.image = view.image
+        self.neighbours = [
+            (Projection.between(view.camera, other.camera), other.image) for other in neighbours
+        ]
+        self.mean = _box(self.image[None])
+        self.variance = _variance(self.image[None], self.mean)
+
+    def __call__(self, inverse_depth: Float[Tensor, "d h w"]) -> Float[Tensor, "d h w"]:
+        """Cost in [0, 1] per hypothesis; 0.5, which says nothing, where no neighbour sees it."""
+        size = max(1, CHUNK_ELEMENTS // (self.image.numel() * len(self.neighbours)))
+        return torch.cat([self._cost(chunk) for chunk in inverse_depth.split(size)])
+
+    def _cost(self, inverse_depth: Float[Tensor, "d h w"]) -> Float[Tensor, "d h w"]:
+        costs = torch.stack(
+            [
+                self._against(projection, image, inverse_depth)
+                for projection, image in self.neighbours
+            ]
+        )
+        better = costs.sort(0).values[: (len(costs) + 1) // 2]
+        seen = better.isfinite()
+        total = torch.where(seen, better, 0).sum(0)
+        return torch.where(seen.any(0), total / seen.sum(0).clamp_min(1), 0.5)
+
+    def _against(
+        self, projection: Projection, image: Float[Tensor, "c h2 w2"], inverse_depth: Tensor
+    ) -> Float[Tensor, "d h w"]:
+        coordinates, inside = projection.normalised(inverse_depth)
+        warped = functional.grid_sample(
+            image[None].expand(len(coordinates), -1, -1, -1),
+            coordinates,
+            padding_mode="border",
+            align_corners=False,
+        )
+        mean = _box(warped)
+        variance = _variance(warped, mean)
+        covariance = (_box(warped * self.image) - mean * self.mean).sum(1)
+        noise = NOISE_VARIANCE * len(image)
+        correlation = covariance * ((variance + noise) * (self.variance + noise)).rsqrt()
+        return torch.where(inside, (1 - correlation.clamp(-1, 1)) / 2, torch.inf)
+
+
+def _variance(image: Float[Tensor, "d c h w"], mean: Tensor) -> Float[Tensor, "d h w"]:
+    return (_box(image.square()) - mean.square()).clamp_min(0).sum(1)
+
+
+def _box(image: Float[Tensor, "d c h w"]) -> Float[Tensor, "d c h w"]:
+    """Mean over a window; at the border over its part inside."""
+    half = WINDOW // 2
+    rows = functional.avg_pool2d(image, (WINDOW, 1), 1, (half, 0), count_include_pad=False)
+    return functional.avg_pool2d(rows, (1, WINDOW), 1, (0, half), count_include_pad=False)

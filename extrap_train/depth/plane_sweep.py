@@ -1,0 +1,116 @@
+"""Depth of one view from its neighbours: a plane sweep on a small image, refined on larger ones."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from extrap_train.depth.photo_cost import PhotoCost, Projection
+from extrap_train.depth.semi_global import semi_global_cost
+from extrap_train.views import View
+
+COARSEST_STEP = 1.2
+"""Largest displacement between two planes in a neighbour, in pixels; the sweep's image is as small as that asks."""
+SMALLEST_SIDE = 64
+"""The sweep's image keeps at least this many pixels on its longer side."""
+REFINEMENT_STEPS = 3
+"""Hypotheses on either side of the estimate that is refined."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Depth of one view from matching alone, before it is checked against other views."""
+
+    inverse_depth: Float[Tensor, "h w"]
+    likeness: Float[Tensor, "h w"]
+    """Correlation of the windows, from 0 (no better than chance, or no texture) to 1."""
+
+
+def sweep(view: View, neighbours: list[View], bounds: tuple[float, float], planes: int) -> Estimate:
+    """Estimate the view's inverse depth within `bounds`, at the view's resolution."""
+    step = (bounds[1] - bounds[0]) / (planes - 1)
+    halvings = _halvings(view, neighbours, step, bounds)
+    small, small_neighbours = _halved(view, halvings), [_halved(n, halvings) for n in neighbours]
+    hypotheses = torch.linspace(*bounds, planes, device=view.image.device)
+    shape = (planes, small.camera.height, small.camera.width)
+    cost = PhotoCost(small, small_neighbours)(hypotheses[:, None, None].expand(shape))
+    cost = semi_global_cost(cost, small.image)
+    inverse_depth = bounds[0] + step * _best_index(cost)[0]
+    width = step
+    for halving in range(halvings, -1, -1):
+        level, others = _halved(view, halving), [_halved(n, halving) for n in neighbours]
+        estimate = _refined(level, others, inverse_depth, width / 2, bounds)
+        inverse_depth, width = estimate.inverse_depth, width / 2
+    return estimate
+
+
+def _refined(
+    view: View,
+    neighbours: list[View],
+    start: Float[Tensor, "h w"],
+    step: float,
+    bounds: tuple[float, float],
+) -> Estimate:
+    size = (view.camera.height, view.camera.width)
+    start = _median(functional.interpolate(start[None, None], size, mode="nearest-exact")[0, 0])
+    offsets = step * torch.arange(-REFINEMENT_STEPS, REFINEMENT_STEPS + 1, device=start.device)
+    cost = PhotoCost(view, neighbours)((start + offsets[:, None, None]).clamp(*bounds))
+    index, least = _best_index(_smooth(cost, view.image))
+    found = start + step * (index - REFINEMENT_STEPS)
+    return Estimate(found.clamp(*bounds), (1 - 2 * least).clamp(0, 1))
+
+
+def _best_index(
+    cost: Float[Tensor, "d h w"],
+) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+    """Index of the least cost, refined by a parabola through it and its neighbours; and that cost."""
+    least, best = cost.min(0)
+    inner = best.clamp(1, len(cost) - 2)[None]
+    before, middle, after = (cost.gather(0, inner + i)[0] for i in (-1, 0, 1))
+    curvature = (before - 2 * middle + after).clamp_min(1e-6)
+    shift = ((before - after) / (2 * curvature)).clamp(-0.5, 0.5)
+    return torch.where(best == inner[0], best + shift, best.to(cost.dtype)), least
+
+
+def _smooth(cost: Float[Tensor, "d h w"], image: Float[Tensor, "3 h w"]) -> Float[Tensor, "d h w"]:
+    return cost
+
+
+def _median(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """3 × 3 median: removes lone outliers, keeps edges."""
+    padded = functional.pad(depth[None, None], (1, 1, 1, 1), mode="replicate")
+    windows = padded[0, 0].unfold(0, 3, 1).unfold(1, 3, 1).flatten(-2)
+    return windows.median(-1).values
+
+
+def _halved(view: View, times: int) -> View:
+    if times == 0:
+        return view
+    return view.resized(
+        max(1, round(view.camera.height / 2**times)), max(1, round(view.camera.width / 2**times))
+    )
+
+
+def _halvings(view: View, neighbours: list[View], step: float, bounds: tuple[float, float]) -> int:
+    """How often to halve the image so that neighbouring planes lie about a pixel apart."""
+    longer = max(view.camera.height, view.camera.width)
+    allowed = max(0, int(math.log2(longer / SMALLEST_SIDE)))
+    wanted = math.ceil(math.log2(_plane_spacing(view, neighbours, step, bounds) / COARSEST_STEP))
+    return min(max(wanted, 0), allowed)
+
+
+def _plane_spacing(
+    view: View, neighbours: list[View], step: float, bounds: tuple[float, float]
+) -> float:
+    """Median displacement between two planes, in pixels."""
+    camera = view.camera.resized(8, 8)
+    middle = torch.full((8, 8), sum(bounds) / 2, device=view.image.device)
+    spacings = []
+    for other in neighbours:
+        projection = Projection.between(camera, other.camera)
+        moved = projection.points(middle + step)[0] - projection.points(middle)[0]
+        spacings.append(moved.norm(dim=-1).median())
+    return float(torch.stack(spacings).median())

@@ -1,0 +1,128 @@
+"""Depth by plane-sweep multi-view stereo (Collins, 1996) from photographs with known cameras."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from extrap_train.config import StereoConfig
+from extrap_train.depth import DepthMap, PointMaps, point_maps_of
+from extrap_train.depth.consistency import agreement, forward_backward_error
+from extrap_train.depth.depth_range import inverse_depth_range, scene_center
+from extrap_train.depth.neighbours import choose_neighbours
+from extrap_train.depth.plane_sweep import Estimate, sweep
+from extrap_train.errors import InputError
+from extrap_train.views import View
+
+SAME_SURFACE = 0.02
+"""Relative difference of depth below which neighbouring pixels are interpolated when a map is enlarged."""
+
+
+@dataclass(frozen=True)
+class PlaneSweepStereo:
+    """Depth wherever two views see the same textured surface.
+
+    Confidence is the correlation of the windows (0 to 1) times how well the neighbours' depths agree; it is 0
+    where they contradict the estimate, no neighbour sees the pixel, or there is no texture. Depth is kept
+    there too: `DepthMap.reliable` says what to use. The scene must not move.
+    """
+
+    config: StereoConfig
+
+    @property
+    def image_size(self) -> int:
+        """Longer side that depth is estimated at, in pixels."""
+        return self.config.image_size
+
+    def depth_map(self, view: View, neighbours: Sequence[View]) -> DepthMap:
+        """One view's depth; the neighbours' are computed too, for the consistency check."""
+        views = [view, *neighbours]
+        helpers = self._helpers(views)
+        for other in range(1, len(views)):
+            rest = [i for i in helpers[other] if i != 0]
+            helpers[other] = [0, *rest][: self.config.neighbours]
+        return self._maps(views, helpers, wanted=[0])[0]
+
+    def depth_maps(self, views: Sequence[View]) -> list[DepthMap]:
+        """Depth of every view of a capture; each is matched once and checked against its neighbours."""
+        return self._maps(list(views), self._helpers(list(views)), wanted=range(len(views)))
+
+    def point_maps(self, first: View, second: View) -> PointMaps:
+        """Both views' points in the first camera's frame."""
+        one, two = self._maps([first, second], [[1], [0]], wanted=(0, 1))
+        return point_maps_of(first, one, second, two)
+
+    def _helpers(self, views: list[View]) -> list[list[int]]:
+        cameras = [view.camera for view in views]
+        helpers = choose_neighbours(cameras, scene_center(cameras), self.config.neighbours)
+        for view, chosen in zip(views, helpers, strict=True):
+            if not chosen:
+                raise InputError(
+                    f"{view.name or 'a view'}: no other view sees the scene from within 45°, which "
+                    "depth=stereo needs; use depth=dataset or add photographs"
+                )
+        return helpers
+
+    def _maps(
+        self, views: list[View], helpers: list[list[int]], wanted: Sequence[int]
+    ) -> list[DepthMap]:
+        working = [self._working(view) for view in views]
+        center = scene_center([view.camera for view in views])
+        needed = sorted({*wanted, *(j for i in wanted for j in helpers[i])})
+        estimates = {
+            i: self._estimate(working[i], [working[j] for j in helpers[i]], center) for i in needed
+        }
+        maps = []
+        for i in wanted:
+            checked = _checked(i, helpers[i], working, estimates)
+            maps.append(_enlarged(checked, views[i].camera.height, views[i].camera.width))
+        return maps
+
+    def _working(self, view: View) -> View:
+        """The view at the resolution of matching."""
+        view = replace(view, depth=None, mask=None)
+        scale = self.config.image_size / max(view.camera.height, view.camera.width)
+        if scale >= 1:
+            return view
+        return view.resized(
+            max(1, round(view.camera.height * scale)), max(1, round(view.camera.width * scale))
+        )
+
+    def _estimate(
+        self, view: View, neighbours: list[View], center: Float[Tensor, "3"] | None
+    ) -> Estimate:
+        bounds = inverse_depth_range(view.camera, [n.camera for n in neighbours], center)
+        return sweep(view, neighbours, bounds, self.config.planes)
+
+
+def _checked(
+    index: int, helpers: list[int], views: list[View], estimates: dict[int, Estimate]
+) -> DepthMap:
+    own = estimates[index]
+    errors = [
+        forward_backward_error(
+            own.inverse_depth,
+            views[index].camera,
+            estimates[other].inverse_depth,
+            views[other].camera,
+        )
+        for other in helpers
+    ]
+    return DepthMap(1 / own.inverse_depth, own.likeness * agreement(torch.stack(errors)))
+
+
+def _enlarged(depth_map: DepthMap, height: int, width: int) -> DepthMap:
+    """At the size of the photograph: interpolated on a surface, by nearest pixel at edges."""
+    size = (height, width)
+    if depth_map.depth.shape == size:
+        return depth_map
+    both = torch.stack([depth_map.depth, depth_map.confidence])[None]
+    nearest = functional.interpolate(both, size, mode="nearest-exact")[0]
+    smooth = functional.interpolate(both, size, mode="bilinear", align_corners=False)[0]
+    same = (smooth[0] - nearest[0]).abs() < SAME_SURFACE * nearest[0]
+    return DepthMap(
+        torch.where(same, smooth[0], nearest[0]), torch.where(same, smooth[1], nearest[1])
+    )
