@@ -1,0 +1,1 @@
+"""Data preparation: sequences in, pairs out; and the synthetic sequences themselves."""

@@ -1,0 +1,20 @@
+"""Six categories of textured objects in lit surroundings, with exact depth. The world's +Z is up.
+
+`build_scene` draws a scene, `handheld_orbit` a walk around it, `render` a photograph, `surface_points`
+the ground-truth cloud. Everything follows from (category, index, seed) alone.
+"""
+
+from extrap_train.data.synthetic.build import build_scene
+from extrap_train.data.synthetic.orbit import handheld_orbit
+from extrap_train.data.synthetic.points import SurfacePoints, surface_points
+from extrap_train.data.synthetic.render import render
+from extrap_train.data.synthetic.scene import SyntheticScene
+
+__all__ = [
+    "SurfacePoints",
+    "SyntheticScene",
+    "build_scene",
+    "handheld_orbit",
+    "render",
+    "surface_points",
+]

@@ -1,0 +1,179 @@
+"""Cups: mugs, tea cups and beakers with a handle; glazed in one colour, banded, checked or printed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from extrap_train.data.synthetic.ground import draw_seed
+from extrap_train.data.synthetic.material import (
+    Color,
+    Material,
+    Mottled,
+    Plain,
+    Surface,
+    linear_color,
+    mix,
+    step,
+    varied,
+)
+from extrap_train.data.synthetic.scene import Part, placement
+from extrap_train.data.synthetic.shapes import Mesh, lathe, sweep
+
+_GLAZES = ["#e9e4d8", "#2f5f8f", "#b5382f", "#d9a83a", "#4f7f6a", "#2b2b30", "#c98fa0", "#8fb0c0"]
+
+
+@dataclass(frozen=True)
+class Print:
+    """Bands, stripes, dots or diamonds around a cup, in the coordinates of its outside."""
+
+    base: Color
+    ink: Color
+    second: Color
+    pattern: str
+    """`bands`, `stripes`, `dots`, `zigzag` or `emblem`."""
+    count: int
+    low: float
+    high: float
+    """Heights that the pattern lies between."""
+    radius: float
+
+    def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
+        """Reflectance in linear light."""
+        x, y, z = surface.points.T
+        turn = np.arctan2(y, x) / (2 * np.pi)
+        blur = surface.footprint
+        inside = step(z - self.low, blur) * step(self.high - z, blur)
+        height = (z - self.low) / (self.high - self.low)
+        around = turn * self.count
+        cell = 2 * np.pi * self.radius / self.count
+        ink = getattr(self, f"_{self.pattern}")(height, around, cell, blur)
+        color = mix(self.base, self.ink, ink * inside)
+        rim = step(z - self.high - 0.02, blur) + step(self.low - 0.02 - z, blur)
+        return mix(color, self.second, rim)
+
+    def _bands(self, height, around, cell, blur):
+        wave = 0.5 - np.abs(height * 3 - np.floor(height * 3) - 0.5)
+        return step((wave - 0.22) * (self.high - self.low) / 3, blur)
+
+    def _stripes(self, height, around, cell, blur):
+        return step((np.abs(around - np.round(around)) - 0.25) * cell, blur)
+
+    def _dots(self, height, around, cell, blur):
+        rows = height * (self.high - self.low) / cell
+        shifted = around + 0.5 * (np.floor(rows) % 2)
+        far = np.hypot(shifted - np.round(shifted), rows - np.floor(rows) - 0.5)
+        return step((0.33 - far) * cell, blur)
+
+    def _zigzag(self, height, around, cell, blur):
+        line = 0.25 + 0.5 * 2 * np.abs(around - np.round(around))
+        return step((0.2 - np.abs(height - line)) * (self.high - self.low), blur)
+
+    def _emblem(self, height, around, cell, blur):
+        sides = around * 2 / self.count + 0.5  # beside the handle, not under it
+        x = (sides - np.round(sides)) * cell * self.count / 2
+        y = (height - 0.5) * (self.high - self.low)
+        size = 0.42 * (self.high - self.low)
+        disc = step(size - np.hypot(x, y), blur)
+        star = step(size * 0.75 - (np.abs(x) + np.abs(y)), blur)
+        return disc * (1 - 0.9 * star)
+
+
+def build(rng: np.random.Generator) -> list[Part]:
+    """One cup with its handle at +X, sometimes on a saucer."""
+    height = rng.uniform(0.65, 1.0)
+    rim = rng.uniform(0.34, 0.48)
+    foot = rim * rng.uniform(0.6, 1.02)
+    belly = rng.uniform(-0.05, 0.12) * rim
+    glaze, ink, second = rng.permutation(len(_GLAZES))[:3]
+    colors = [varied(rng, [_GLAZES[i]], 0.08) for i in (glaze, ink, second)]
+    low, high = np.sort(rng.uniform(0.15, 0.9, 2)) if rng.random() < 0.3 else (0.18, 0.82)
+    pattern = str(rng.choice(["bands", "stripes", "dots", "zigzag", "emblem"]))
+    outside = Print(
+        colors[0],
+        colors[1],
+        colors[2] if rng.random() < 0.4 else colors[0],
+        pattern,
+        int(rng.integers(6, 13)),
+        low * height,
+        max(high, low + 0.2) * height,
+        rim,
+    )
+    gloss = rng.uniform(0.4, 0.9)
+    inner = Material(
+        Plain(colors[rng.integers(3)] if rng.random() < 0.5 else linear_color("#efeae0")), gloss
+    )
+    wall = rng.uniform(0.03, 0.05)
+    profile = _profile(height, rim, foot, belly)
+    parts = [
+        Part(_outer(profile, wall), Material(outside, gloss, 80)),
+        Part(_inner(profile, wall), inner),
+    ]
+    handle_color = colors[rng.choice([0, 0, 1, 2])]
+    parts.append(Part(_handle(rng, profile, height), Material(Plain(handle_color), gloss, 80)))
+    if rng.random() < 0.6:
+        parts.append(_drink(rng, profile, wall, height))
+    if rng.random() < 0.35:
+        rise = 0.06
+        parts = [Part(p.mesh, p.material, placement((0, 0, rise))) for p in parts]
+        parts.append(_saucer(rng, rim, Material(Plain(colors[0]), gloss)))
+    return parts
+
+
+def _profile(height: float, rim: float, foot: float, belly: float) -> Float[np.ndarray, "k 2"]:
+    t = np.linspace(0, 1, 14)
+    radius = foot + (rim - foot) * t**0.7 + 4 * belly * t * (1 - t)
+    return np.stack([radius, t * height], -1)
+
+
+def _outer(profile: Float[np.ndarray, "k 2"], wall: float) -> Mesh:
+    """Foot, side and the rounded rim."""
+    top = profile[-1]
+    lip = [top + [-wall * 0.2, wall * 0.35], top + [-wall * 0.5, wall * 0.45]]
+    return lathe(np.concatenate([[[0, 0]], profile, lip]), 48)
+
+
+def _inner(profile: Float[np.ndarray, "k 2"], wall: float) -> Mesh:
+    top = profile[-1] + [-wall * 0.5, wall * 0.45]
+    side = (profile - [wall, 0])[::-1]
+    side = side[side[:, 1] > wall * 1.5]
+    return lathe(np.concatenate([[top], side, [[0, wall * 1.5]]]), 40)
+
+
+def _handle(rng: np.random.Generator, profile: Float[np.ndarray, "k 2"], height: float) -> Mesh:
+    """A loop, round, square-ish or ear-shaped."""
+    low, high = rng.uniform(0.15, 0.3) * height, rng.uniform(0.72, 0.88) * height
+    reach = rng.uniform(0.2, 0.32)
+    angle = np.linspace(-np.pi / 2, np.pi / 2, 18)
+    power = rng.uniform(0.45, 1.0)
+    out = np.abs(np.cos(angle)) ** power * reach
+    z = (low + high) / 2 + np.sign(np.sin(angle)) * np.abs(np.sin(angle)) ** power * (
+        high - low
+    ) / 2
+    wall = np.interp(z, profile[:, 1], profile[:, 0]) - 0.015
+    drop = rng.uniform(0.0, 0.25) * out * (angle < 0)
+    path = np.stack([wall + out, np.zeros_like(z), z + drop], -1)
+    return sweep(path, rng.uniform(0.035, 0.055), 12, flatten=rng.uniform(0.7, 1.3))
+
+
+def _drink(
+    rng: np.random.Generator, profile: Float[np.ndarray, "k 2"], wall: float, height: float
+) -> Part:
+    level = height * rng.uniform(0.7, 0.9)
+    radius = np.interp(level, profile[:, 1], profile[:, 0]) - wall * 0.8
+    color = varied(rng, ["#3a2012", "#7a4a22", "#a8702f", "#cdbb9c"])
+    disc = lathe(np.array([[radius, level], [0, level]]), 32)
+    return Part(disc, Material(Mottled(color * 0.8, color * 1.2, 5.0, draw_seed(rng)), 0.8, 120))
+
+
+def _saucer(rng: np.random.Generator, rim: float, glaze: Material) -> Part:
+    wide = rim * rng.uniform(1.45, 1.75)
+    profile = [
+        [0, 0.0],
+        [wide * 0.5, 0.0],
+        [wide, 0.1],
+        [wide, 0.12],
+        [wide * 0.55, 0.05],
+        [0, 0.045],
+    ]
+    return Part(lathe(np.array(profile), 40), glaze)

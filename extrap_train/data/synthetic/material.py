@@ -1,0 +1,228 @@
+"""What a surface looks like: solid textures in linear light, evaluated where a ray hits."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float
+
+from extrap_train.data.synthetic.noise import fractal_noise
+
+Color = Float[np.ndarray, " 3"]
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Where rays hit one part, in the part's own coordinates."""
+
+    points: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    footprint: Float[np.ndarray, " n"]
+    """Width of a pixel on the surface."""
+
+    def planar(self) -> Float[np.ndarray, "n 2"]:
+        """Coordinates along the box side that the normal points out of; the second is z on a wall."""
+        axis = np.abs(self.normals).argmax(1)
+        x, y, z = self.points.T
+        return np.stack([np.where(axis == 0, y, x), np.where(axis == 2, y, z)], -1)
+
+
+class Texture(Protocol):
+    """A colour for every point of a surface."""
+
+    def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
+        """Reflectance in linear light, 0 … 1."""
+        ...
+
+
+@dataclass(frozen=True)
+class Material:
+    """A texture and how it answers light."""
+
+    texture: Texture
+    gloss: float = 0.0
+    """Strength of the highlight."""
+    shininess: float = 60.0
+    """Blinn-Phong exponent."""
+    roughness: float = 0.0
+    """How far fine noise tilts the normals."""
+    roughness_frequency: float = 20.0
+    glow: float = 0.0
+    """Share of the colour that shines by itself (sky, lamps)."""
+
+
+def linear_color(code: str) -> Color:
+    """The linear-light colour of a `#rrggbb` code."""
+    encoded = np.array([int(code[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+    return srgb_to_linear(encoded)
+
+
+def srgb_to_linear(encoded: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """IEC 61966-2-1, decoding."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+def linear_to_srgb(linear: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """IEC 61966-2-1, encoding; `linear` within 0 … 1."""
+    return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def varied(rng: np.random.Generator, codes: list[str], spread: float = 0.12) -> Color:
+    """One of the colours, a little lighter, darker or tinted."""
+    color = linear_color(codes[rng.integers(len(codes))])
+    tint = rng.normal(0, spread / 2, 3) + rng.normal(0, spread)
+    return np.clip(color * np.exp(tint), 0.01, 0.95)
+
+
+def mix(a: np.ndarray, b: np.ndarray, share: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+    """From `a` (share 0) to `b` (share 1); each a colour or one colour per point."""
+    t = np.clip(share, 0, 1).astype(np.float32)[:, None]
+    return a + (b - a) * t
+
+
+def step(x: Float[np.ndarray, " n"], footprint: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """0 for x < 0 and 1 for x > 0, with an edge as wide as a pixel."""
+    return np.clip(x / np.maximum(footprint, 1e-6) + 0.5, 0, 1)
+
+
+@dataclass(frozen=True)
+class Plain:
+    """One colour."""
+
+    color: Color
+
+    def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
+        """Reflectance in linear light."""
+        return np.broadcast_to(self.color, surface.points.shape)
+
+
+@dataclass(frozen=True)
+class Mottled:
+    """Two colours blended by noise: plaster, grass, carpet, stone, fur; stretched: brushed or grained."""
+
+    low: Color
+    high: Color
+    frequency: float
+    seed: int
+    octaves: int = 3
+    contrast: float = 1.0
+    stretch: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+    def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
+        """Reflectance in linear light."""
+        points = surface.points * np.float32(self.stretch)
+        footprint = surface.footprint * np.float32(min(self.stretch))
+        noise = fractal_noise(points, footprint, self.frequency, self.octaves, self.seed)
+        return mix(self.low, self.high, 0.5 + self.contrast * noise)
+
+
+@dataclass(frozen=True)
+class Wood:
+    """Growth rings of a trunk along `axis`, wavered by noise."""
+
+    low: Color
+    high: Color
+    seed: int
+    axis: int = 2
+    rings: float = 9.0
+    """Per unit length."""
+
+    def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
+        """Reflectance in linear light."""
+        stretch = np.ones(3, np.float32)
+        stretch[self.axis] = 0.15
+        points = surface.points * stretch + np.float32([0.37, 0.21, 0.13])
+        across = [i for i in range(3) if i != self.axis]
+        radius = np.hypot(points[:, across[0]], points[:, across[1]])
+        waver = fractal_noise(points, surface.footprint, self.rings / 3, 2, self.seed)
+        fine = fractal_noise(points, surface.footprint, self.rings * 3, 2, self.seed + 7)
+        phase = radius * self.rings + waver * 1.5
+        kept = np.clip(1.2 - surface.footprint * self.rings * 2, 0, 1)
+        rings = 0.5 + 0.5 * np.sin(2 * np.pi * phase) * kept
+        return mix(self.low, self.high, 0.75 * rings + 0.5 * fine)
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """Rectangles with joints over the box sides: pavement, bricks, floorboards, tiles, window grids."""
+
+    inside: Texture
+    joint: Color
+    size: tuple[float, float]
+    seed: int
+    joint_width: float = 0.03
+    offset: float = 0.0
+    """Shift of every other row, as a share of a tile."""
+    shades: float = 0.25
+    """Spread of the tiles' brightness."""
+    second: Color | None = None
+    """Every other tile in this colour, as on a chessboard."""
+
+    def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
+        """Reflectance in linear light."""
+        x, y = surface.planar().T
+        row = np.floor(y / self.size[1])
+        x = x + self.offset * self.size[0] * (row % 2)
+        column = np.floor(x / self.size[0])
+        to_edge = np.minimum(_edge_distance(x, self.size[0]), _edge_distance(y, self.size[1]))
+        mixed = np.sin(column * 127.1 + row * 311.7 + self.seed % 1000) * 43758.5
+        shade = 1 + self.shades * (2 * (mixed - np.floor(mixed)) - 1)
+        blur = np.clip(1.5 - 2 * surface.footprint / min(self.size), 0, 1)
+        color = self.inside(surface)
+        if self.second is not None:
+            color = mix(color, self.second, ((row + column) % 2) * blur + 0.5 * (1 - blur))
+        color = color * (1 + (shade - 1) * blur)[:, None]
+        share = step(self.joint_width / 2 - to_edge, surface.footprint)
+        mean = np.clip(self.joint_width / min(self.size) * 1.5, 0, 1)
+        return mix(color, self.joint, share * blur + mean * (1 - blur))
+
+
+def _edge_distance(x: Float[np.ndarray, " n"], period: float) -> Float[np.ndarray, " n"]:
+    """Distance to the nearest multiple of `period`."""
+    phase = x / period
+    return np.abs(phase - np.round(phase)) * period
+
+
+@dataclass(frozen=True)
+class Plaid:
+    """Crossing bands of woven cloth."""
+
+    base: Color
+    warp: Color
+    weft: Color
+    period: float
+    width: float = 0.4
+    """Share of the period that a band takes."""
+
+    def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
+        """Reflectance in linear light."""
+        x, y = surface.planar().T
+        kept = np.clip(1.5 - 2 * surface.footprint / self.period, 0, 1)
+        half = self.width * self.period / 2
+        bands = [
+            step(half - _edge_distance(t, self.period), surface.footprint) * kept
+            + self.width * (1 - kept)
+            for t in (x, y)
+        ]
+        return mix(mix(self.base, self.warp, 0.6 * bands[0]), self.weft, 0.6 * bands[1])
+
+
+@dataclass(frozen=True)
+class Worn:
+    """Another texture with patches of rust, dirt or stains that gather towards the bottom."""
+
+    under: Texture
+    stain: Color
+    amount: float
+    """0 is spotless, 1 about half covered."""
+    frequency: float
+    seed: int
+    low_height: float = 0.25
+    """Height below which dirt gathers."""
+
+    def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
+        """Reflectance in linear light."""
+        noise = fractal_noise(surface.points, surface.footprint, self.frequency, 3, self.seed)
+        height = np.clip(1 - surface.points[:, 2] / self.low_height, 0, 1)
+        share = (noise - 0.75 + self.amount * (0.6 + 0.6 * height)) * 5
+        return mix(self.under(surface), self.stain, np.clip(share, 0, 0.85))
