@@ -1,13 +1,16 @@
 """CO3D's annotation entries (v1 and v2) as typed records, their JSON checked."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from extrap_train.data.files import check_relative, read_json
 from extrap_train.data.validation import require_list
 from extrap_train.errors import InputError
 from extrap_train.geometry.pytorch3d import NDC_FORMATS
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +58,7 @@ def read_sequence_annotations(file: Path) -> dict[str, SequenceAnnotation]:
     return {entry.name: entry for entry in _parse_all(file, _sequence)}
 
 
-def _parse_all(file: Path, parse: Any) -> list[Any]:
+def _parse_all(file: Path, parse: Callable[[Any, Path], T]) -> list[T]:
     entries = require_list(read_json(file), "annotations", file)
     parsed = []
     for index, entry in enumerate(entries):
@@ -74,7 +77,7 @@ def _parse_all(file: Path, parse: Any) -> list[Any]:
     return parsed
 
 
-def _frame(entry: dict[str, Any], file: Path) -> FrameAnnotation:
+def _frame(entry: Any, file: Path) -> FrameAnnotation:
     image, viewpoint = entry["image"], entry.get("viewpoint")
     height, width = (_typed(side, int, "image size") for side in image["size"])
     if height <= 0 or width <= 0:
@@ -95,7 +98,7 @@ def _frame(entry: dict[str, Any], file: Path) -> FrameAnnotation:
     )
 
 
-def _depth(entry: dict[str, Any] | None, file: Path) -> DepthFiles | None:
+def _depth(entry: Any, file: Path) -> DepthFiles | None:
     if not entry or not entry.get("path"):
         return None
     return DepthFiles(
@@ -105,7 +108,7 @@ def _depth(entry: dict[str, Any] | None, file: Path) -> DepthFiles | None:
     )
 
 
-def _sequence(entry: dict[str, Any], file: Path) -> SequenceAnnotation:
+def _sequence(entry: Any, file: Path) -> SequenceAnnotation:
     cloud = entry.get("point_cloud")
     return SequenceAnnotation(
         name=_typed(entry["sequence_name"], str, "sequence_name"),
@@ -119,7 +122,7 @@ def _path(value: Any, file: Path) -> str:
     return check_relative(_typed(value, str, "path"), file)
 
 
-def _optional_path(entry: dict[str, Any] | None, key: str, file: Path) -> str | None:
+def _optional_path(entry: Any, key: str, file: Path) -> str | None:
     value = entry.get(key) if entry else None
     return _path(value, file) if value else None
 

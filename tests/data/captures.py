@@ -1,0 +1,44 @@
+"""A tiny capture with every kind of file, made for the readers' tests."""
+
+import gzip
+import json
+from pathlib import Path
+
+import torch
+from scenes import Scene, orbit_camera, plane, sphere
+
+from extrap_train.data.co3d_writer import write_annotations, write_frame, write_sequence
+from extrap_train.views import View
+
+SCENE = Scene((sphere(0.8), plane(0.9, (0.0, 1.0, 0.0))))
+
+
+def view_at(azimuth_deg: float, size: int = 32) -> View:
+    camera = orbit_camera(azimuth_deg, size=size).cropped(0, 0, size, size + 8)
+    depth = SCENE.depth(camera)
+    mask = (Scene((sphere(0.8),)).depth(camera) > 0).float()
+    return View(SCENE.image(camera), camera, depth, mask)
+
+
+def write_capture(root: Path, names: tuple[str, ...] = ("one", "two"), frames: int = 3) -> None:
+    """Category `cup` with sequences of a few frames; the frame numbers are 1, 11, 21, …"""
+    entries = [
+        # Written backwards: the reader is to sort.
+        write_frame(root, "cup", name, 10 * index + 1, view_at(30 * index))
+        for name in names
+        for index in reversed(range(frames))
+    ]
+    points, colors = torch.rand(20, 3), torch.rand(20, 3)
+    sequences = [write_sequence(root, "cup", name, points, colors) for name in names]
+    write_annotations(
+        root, "cup", entries, sequences, {"train": list(names[:1]), "test": list(names[1:])}
+    )
+
+
+def frame_entries(root: Path) -> list[dict]:
+    return json.loads(gzip.decompress((root / "cup" / "frame_annotations.jgz").read_bytes()))
+
+
+def replace_frame_entries(root: Path, entries: object) -> None:
+    content = gzip.compress(json.dumps(entries).encode())
+    (root / "cup" / "frame_annotations.jgz").write_bytes(content)

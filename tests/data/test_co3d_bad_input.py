@@ -1,0 +1,236 @@
+"""Whatever is wrong with a download is said in one line that names the file and a way out."""
+
+import gzip
+import json
+
+import numpy as np
+import pytest
+from captures import frame_entries, replace_frame_entries, write_capture
+from PIL import Image
+
+from extrap_train.data.co3d import read_category, read_sequence, read_set_list
+from extrap_train.data.files import GZIP_FLOOR_BYTES
+from extrap_train.errors import InputError
+
+ANNOTATIONS = "frame_annotations.jgz"
+
+
+@pytest.fixture
+def root(tmp_path):
+    write_capture(tmp_path, names=("one",), frames=1)
+    return tmp_path
+
+
+def complaint(read, *arguments) -> str:
+    with pytest.raises(InputError) as caught:
+        read(*arguments)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert ";" in message, "says what to do after a semicolon"
+    return message
+
+
+def load_first(root):
+    read_category(root, "cup")[0].frames[0].load()
+
+
+def test_missing_root(tmp_path):
+    message = complaint(read_category, tmp_path / "nowhere", "cup")
+    assert "nowhere: no such folder; set data.root" in message
+
+
+def test_unknown_category_lists_those_present(root):
+    assert "'cap'; categories present: cup" in complaint(read_category, root, "cap")
+
+
+def test_category_climbing_out_is_unknown(root):
+    assert "no category '../cup'" in complaint(read_category, root, "../cup")
+
+
+@pytest.mark.parametrize("content", [[], {}, None, "text"])
+def test_category_without_sequences(root, content):
+    replace_frame_entries(root, content)
+    assert f"{ANNOTATIONS}: expected annotations in a list" in complaint(read_category, root, "cup")
+
+
+def test_no_frame_with_a_camera(root):
+    entry = frame_entries(root)[0] | {"viewpoint": None}
+    replace_frame_entries(root, [entry])
+    assert "no frame has a camera" in complaint(read_category, root, "cup")
+
+
+def test_missing_sequence_annotations(root):
+    (root / "cup" / "sequence_annotations.jgz").unlink()
+    message = complaint(read_category, root, "cup")
+    assert "sequence_annotations.jgz: no such file; is the download complete" in message
+
+
+def test_truncated_annotations(root):
+    file = root / "cup" / ANNOTATIONS
+    file.write_bytes(file.read_bytes()[:-20])
+    assert f"{ANNOTATIONS}: is a truncated or damaged gzip" in complaint(read_category, root, "cup")
+
+
+def test_damaged_annotations(root):
+    file = root / "cup" / ANNOTATIONS
+    content = bytearray(file.read_bytes())
+    content[30:60] = b"\xff" * 30
+    file.write_bytes(content)
+    assert f"{ANNOTATIONS}: is a truncated or damaged gzip" in complaint(read_category, root, "cup")
+
+
+def test_annotations_that_are_not_gzip(root):
+    (root / "cup" / ANNOTATIONS).write_text("[]")
+    assert f"{ANNOTATIONS}: is not a gzip file" in complaint(read_category, root, "cup")
+
+
+@pytest.mark.parametrize("content", [b"[{]", b"\xff\xfe\x00", b"[" * 100_000])
+def test_annotations_that_are_not_json(root, content):
+    (root / "cup" / ANNOTATIONS).write_bytes(gzip.compress(content))
+    assert f"{ANNOTATIONS}: is not valid JSON" in complaint(read_category, root, "cup")
+
+
+def test_gzip_bomb(root):
+    bomb = gzip.compress(b"[" + b" " * (2 * GZIP_FLOOR_BYTES))
+    (root / "cup" / ANNOTATIONS).write_bytes(bomb)
+    assert "expands to more than" in complaint(read_category, root, "cup")
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"image": None}, "entry 0 is malformed"),
+        ({"image": {"path": "x.jpg"}}, "entry 0 has no 'size'"),
+        ({"image": {"path": "x.jpg", "size": [32]}}, "entry 0 is malformed"),
+        ({"image": {"path": "x.jpg", "size": [0, 40]}}, "image size 0 x 40"),
+        ({"image": {"path": "x.jpg", "size": ["32", "40"]}}, "image size is '32'"),
+        ({"image": {"path": 7, "size": [32, 40]}}, "path is 7"),
+        ({"sequence_name": 5}, "sequence_name is 5"),
+        ({"frame_number": "1"}, "frame_number is '1'"),
+        ({"depth": {"path": "x.png"}}, "entry 0 has no 'scale_adjustment'"),
+        ({"depth": ["x.png"]}, "entry 0 is malformed"),
+        ({"viewpoint": [1]}, "entry 0 is malformed"),
+    ],
+)
+def test_annotations_of_the_wrong_shape(root, change, expected):
+    replace_frame_entries(root, [frame_entries(root)[0] | change])
+    message = complaint(read_category, root, "cup")
+    assert ANNOTATIONS in message
+    assert expected in message
+
+
+@pytest.mark.parametrize("entry", [None, 3, [], "text"])
+def test_entries_that_are_no_objects(root, entry):
+    replace_frame_entries(root, [entry])
+    assert "entry 0 is malformed" in complaint(read_category, root, "cup")
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["../x.jpg", "cup/../../x.jpg", "/etc/passwd", "C:\\x.jpg", "a\\..\\..\\x.jpg", "", "\0"],
+)
+@pytest.mark.parametrize("kind", ["image", "depth", "mask"])
+def test_paths_that_leave_the_root(root, kind, path):
+    entry = frame_entries(root)[0]
+    entry[kind]["path"] = path
+    replace_frame_entries(root, [entry])
+    if path or kind == "image":
+        assert "climbs out of its folder" in complaint(read_category, root, "cup")
+
+
+def test_symbolic_links_that_leave_the_root(root, tmp_path_factory):
+    outside = tmp_path_factory.mktemp("outside") / "x.jpg"
+    image = root / frame_entries(root)[0]["image"]["path"]
+    image.rename(outside)
+    image.symlink_to(outside)
+    assert "frame000001.jpg: leads out of" in complaint(load_first, root)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"R": [[float("nan")] * 3] * 3}, "camera of one frame 1 is degenerate"),
+        ({"R": np.zeros((3, 3)).tolist()}, "is degenerate"),
+        ({"R": (2 * np.eye(3)).tolist()}, "is degenerate"),
+        ({"R": np.diag([1.0, 1, -1]).tolist()}, "is degenerate"),
+        ({"T": [0, float("inf"), 0]}, "is degenerate"),
+        ({"focal_length": [0, 1]}, "is degenerate"),
+        ({"focal_length": [-1, -1]}, "is degenerate"),
+        ({"R": [1, 2, 3]}, "has no R of 3 x 3 numbers"),
+        ({"T": None}, "has no T of 3 numbers"),
+        ({"T": ["a", "b", "c"]}, "has no T of 3 numbers"),
+        ({"principal_point": [0]}, "has no principal_point of 2 numbers"),
+        ({"intrinsics_format": "pixels"}, "intrinsics_format 'pixels' is none of ndc_isotropic"),
+    ],
+)
+def test_degenerate_cameras(root, change, expected):
+    entry = frame_entries(root)[0]
+    entry["viewpoint"] |= change
+    replace_frame_entries(root, [entry])
+    message = complaint(read_category, root, "cup")
+    assert ANNOTATIONS in message
+    assert expected in message
+
+
+def test_missing_image(root):
+    (root / frame_entries(root)[0]["image"]["path"]).unlink()
+    assert "frame000001.jpg: no such file" in complaint(load_first, root)
+
+
+@pytest.mark.parametrize("keep", [0, 10, 200])
+def test_unreadable_image(root, keep):
+    image = root / frame_entries(root)[0]["image"]["path"]
+    image.write_bytes(image.read_bytes()[:keep])
+    assert "frame000001.jpg: " in complaint(load_first, root)
+
+
+def test_truncated_image(root):
+    image = root / frame_entries(root)[0]["image"]["path"]
+    image.write_bytes(image.read_bytes()[:-300])
+    assert "frame000001.jpg: is truncated or damaged" in complaint(load_first, root)
+
+
+def test_truncated_depth(root):
+    depth = root / frame_entries(root)[0]["depth"]["path"]
+    depth.write_bytes(depth.read_bytes()[:-100])
+    assert "geometric.png: is truncated or damaged" in complaint(load_first, root)
+
+
+@pytest.mark.parametrize("kind", ["image", "depth", "mask"])
+def test_size_that_is_not_the_annotated_one(root, kind):
+    file = root / frame_entries(root)[0][kind]["path"]
+    Image.open(file).resize((20, 16)).save(file)
+    message = complaint(load_first, root)
+    assert f"{file.name}: is 16 x 20 pixels" in message
+    assert "says 32 x 40" in message
+
+
+def test_depth_with_eight_bits(root):
+    file = root / frame_entries(root)[0]["depth"]["path"]
+    Image.fromarray(np.ones((32, 40), np.uint8)).save(file)
+    assert "has pixels of kind L" in complaint(load_first, root)
+
+
+def test_depth_that_is_zero_everywhere(root):
+    file = root / frame_entries(root)[0]["depth"]["path"]
+    Image.fromarray(np.zeros((32, 40), np.uint16)).save(file)
+    assert "depth map is zero everywhere" in complaint(load_first, root)
+
+
+def test_mask_that_is_black_everywhere(root):
+    file = root / frame_entries(root)[0]["mask"]["path"]
+    Image.fromarray(np.zeros((32, 40), np.uint8)).save(file)
+    assert "mask is black everywhere" in complaint(load_first, root)
+
+
+def test_unknown_sequence_suggests_near_names(root):
+    assert "'onne'; did you mean one?" in complaint(read_sequence, root, "cup", "onne")
+
+
+@pytest.mark.parametrize(
+    "content", [[], {"train": 3}, {"train": [["one", 1]]}, {"train": [["one", 1, "../x"]]}]
+)
+def test_set_lists_of_the_wrong_shape(root, content):
+    file = root / "cup" / "set_lists" / "set_lists_manyview_dev_0.json"
+    file.write_text(json.dumps(content))
+    assert file.name in complaint(read_set_list, root, "cup", "manyview_dev_0")
