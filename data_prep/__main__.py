@@ -18,7 +18,6 @@ def _run(config: DataPrepConfig) -> None:
             config.prep,
             output=Path(config.output),
             workers=config.workers or os.cpu_count() or 1,
-            seed=config.seed,
         )
 
 

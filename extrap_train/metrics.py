@@ -1,5 +1,6 @@
 """Image metrics with declared ranges: every image is float in [0, 1], `b 3 h w`; results are one number an image."""
 
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 
@@ -91,5 +92,7 @@ def _state_dict(path: Path) -> dict[str, Tensor]:
         raise InputError(f"LPIPS weights not found: {path} (option validation.lpips_weights)")
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, OSError, EOFError, ValueError) as error:
-        raise InputError(f"LPIPS weights unreadable: {path}: {error}") from error
+    except (RuntimeError, OSError, EOFError, ValueError, pickle.UnpicklingError):
+        raise InputError(
+            f"{path}: is no state dict of plain tensors (option validation.lpips_weights)"
+        ) from None

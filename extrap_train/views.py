@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Self
 
 import torch
 from jaxtyping import Bool, Float
@@ -38,24 +37,24 @@ class Camera:
         """The viewing direction in the world, unit length."""
         return self.world_to_cam[..., 2, :3]
 
-    def cropped(self, top: int, left: int, height: int, width: int) -> Self:
+    def cropped(self, top: int, left: int, height: int, width: int) -> "Camera":
         """The camera of the image's crop; the window may reach beyond the image."""
         shift = torch.zeros_like(self.intrinsics)
         shift[..., 0, 2], shift[..., 1, 2] = left, top
         return replace(self, intrinsics=self.intrinsics - shift, height=height, width=width)
 
-    def resized(self, height: int, width: int) -> Self:
+    def resized(self, height: int, width: int) -> "Camera":
         """The camera of the image resampled to `height` × `width`."""
         rows = self.intrinsics.new_tensor([width / self.width, height / self.height, 1.0])
         return replace(self, intrinsics=self.intrinsics * rows[:, None], height=height, width=width)
 
-    def to(self, device: torch.device | str) -> Self:
+    def to(self, device: torch.device | str) -> "Camera":
         """The same camera on another device."""
         return replace(
             self, world_to_cam=self.world_to_cam.to(device), intrinsics=self.intrinsics.to(device)
         )
 
-    def __getitem__(self, index: int | slice | tuple[int | slice, ...] | Tensor) -> Self:
+    def __getitem__(self, index: int | slice | tuple[int | slice, ...] | Tensor) -> "Camera":
         """Index the leading dimensions."""
         return replace(
             self, world_to_cam=self.world_to_cam[index], intrinsics=self.intrinsics[index]
@@ -84,7 +83,7 @@ class View:
     mask: Float[Tensor, "h w"] | None = None
     name: str = ""
 
-    def cropped(self, top: int, left: int, height: int, width: int) -> Self:
+    def cropped(self, top: int, left: int, height: int, width: int) -> "View":
         """The view's crop; the window must lie inside the image."""
         inside = 0 <= top and 0 <= left
         if not (inside and top + height <= self.camera.height and left + width <= self.camera.width):
@@ -101,7 +100,7 @@ class View:
             mask=None if self.mask is None else self.mask[window],
         )
 
-    def resized(self, height: int, width: int) -> Self:
+    def resized(self, height: int, width: int) -> "View":
         """The view resampled: colours and mask by area, depth by nearest pixel (edges stay edges)."""
         size = (height, width)
         return replace(
@@ -112,7 +111,7 @@ class View:
             mask=None if self.mask is None else _resample_area(self.mask[None], size)[0].clamp(0, 1),
         )
 
-    def squared(self, size: int) -> Self:
+    def squared(self, size: int) -> "View":
         """The largest centred square of the view, resampled to `size` × `size`."""
         side = min(self.camera.height, self.camera.width)
         top, left = (self.camera.height - side) // 2, (self.camera.width - side) // 2
@@ -173,7 +172,7 @@ class PairBatch:
     warp: Warp | None = None
     """Made from the references when the batch is made; None before."""
 
-    def to(self, device: torch.device | str) -> Self:
+    def to(self, device: torch.device | str) -> "PairBatch":
         """The same batch on another device."""
         moved = {
             name: value.to(device)

@@ -72,7 +72,7 @@ class ExampleReader:
         first = pair.references[0]
         angles = self._angles_of(data, pair.sequence)
         candidates = data.reference_frames(pair.sequence)
-        further = extra_references(angles, pair.query, first, count - 1, candidates, rng)
+        further = extra_references(angles, pair.query, first, count, rng, candidates)
         frames = [pair.query, first, *further]
         images, depths, _ = data.frames(pair.sequence, frames)
         cameras = data.cameras(pair.sequence)[torch.tensor(frames)]

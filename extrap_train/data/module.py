@@ -55,10 +55,14 @@ class PositionSampler(Sampler[Positions]):
         for batch in range(self.batches):
             start = first + (batch * self.world + self.rank) * self.batch_size
             positions = range(start, start + self.batch_size)
-            for cycle in {position // self.pairs for position in positions} - orders.keys():
-                orders = {k: v for k, v in orders.items() if k >= cycle - 1}
-                orders[cycle] = np.random.default_rng((self.seed, cycle)).permutation(self.pairs)
+            cycles = {position // self.pairs for position in positions}
+            orders = {
+                cycle: orders[cycle] if cycle in orders else self._order(cycle) for cycle in cycles
+            }
             yield [(p, int(orders[p // self.pairs][p % self.pairs])) for p in positions]
+
+    def _order(self, cycle: int) -> np.ndarray:
+        return np.random.default_rng((self.seed, cycle)).permutation(self.pairs)
 
 
 class TrainingBatches(Dataset[PairBatch]):

@@ -1,12 +1,13 @@
 """Images to latents and back. The small model's latents are pixels: no network, no loss."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
 
+@runtime_checkable
 class Autoencoder(Protocol):
     """What the denoiser needs to know of its latent space."""
 

@@ -5,7 +5,6 @@ all at the latents' resolution, and one cross-attention token from the reference
 """
 
 from dataclasses import dataclass
-from typing import Self
 
 import torch
 from jaxtyping import Bool, Float
@@ -29,14 +28,14 @@ class Conditioning:
     base: Float[Tensor, "b z h w"]
     """Latent that the denoised latent is added to: the filled warp, or zero. No part of the condition."""
 
-    def zeroed(self, where: Bool[Tensor, " b"]) -> Self:
+    def zeroed(self, where: Bool[Tensor, " b"]) -> "Conditioning":
         """The null condition, the same in training and in sampling, for the chosen examples."""
         keep = (~where).to(self.latents.dtype)
         return type(self)(
             self.latents * keep[:, None, None, None], self.embedding * keep[:, None], self.base
         )
 
-    def doubled(self) -> Self:
+    def doubled(self) -> "Conditioning":
         """Condition and null condition stacked along the batch, for guidance in one pass."""
         null = self.zeroed(torch.ones(len(self.latents), dtype=torch.bool, device=self.latents.device))
         pairs = zip(vars(self).values(), vars(null).values(), strict=True)

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrap_train.geometry.opengl import opengl_from_opencv_relative
+from extrap_train.geometry.opengl import opengl_from_world_to_cam
 from extrap_train.views import Camera
 
 POSE_CHANNELS = 19
@@ -30,8 +30,9 @@ def zeronvs_pose(
     translation, in units of the scene scale, is squashed to 0.5·10·tanh(t/10). The field of view is the
     smaller of the query's two, in radians.
     """
-    relative = opengl_from_opencv_relative(reference.world_to_cam @ query.cam_to_world)
-    relative = relative.clone()
+    reference_to_world = opengl_from_world_to_cam(reference.world_to_cam)
+    query_to_world = opengl_from_world_to_cam(query.world_to_cam)
+    relative = torch.linalg.inv(reference_to_world) @ query_to_world
     relative[:, :3, 3] = 5.0 * torch.tanh(relative[:, :3, 3] / scale[:, None] / 10.0)
     fov_rad = torch.minimum(
         2 * torch.atan(query.width / (2 * query.intrinsics[:, 0, 0])),

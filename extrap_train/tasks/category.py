@@ -56,7 +56,6 @@ def run(config: TrainConfig) -> None:
             config.prep,
             output=Path(config.output),
             workers=os.cpu_count() or 1,
-            seed=config.seed,
         )
         for member in config.category.members
     ]

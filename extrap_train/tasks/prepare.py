@@ -28,11 +28,10 @@ def prepare_category(
     *,
     output: Path,
     workers: int,
-    seed: int,
 ) -> PreparedData:
     """Sequences of one category as pairs on disk; what is there already is used again."""
     sequences, test_names = _sequences(category, data, output, workers)
-    folder = output / "data" / f"{category}-{_digest(category, data, depth, prep, seed)}"
+    folder = output / "data" / f"{category}-{_digest(category, data, depth, prep)}"
     return prepare(
         sequences,
         depth_source(depth),
@@ -40,7 +39,6 @@ def prepare_category(
         test_names=test_names,
         folder=folder,
         workers=workers,
-        seed=seed,
     )
 
 
@@ -58,8 +56,6 @@ def _sequences(
     return read_category(Path(data.root), category), data.test_sequences
 
 
-def _digest(
-    category: str, data: DataConfig, depth: DepthConfig, prep: PrepConfig, seed: int
-) -> str:
-    parts = [category, asdict(data), asdict(depth), asdict(prep), seed]
+def _digest(category: str, data: DataConfig, depth: DepthConfig, prep: PrepConfig) -> str:
+    parts = [category, asdict(data), asdict(depth), asdict(prep)]
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:8]

@@ -1,0 +1,107 @@
+"""Batches are a function of seed and position alone; a mirrored example is a consistent scene."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from extrap_train.data.examples import Example, mirrored
+from extrap_train.data.module import PositionSampler, spread, with_warp
+from extrap_train.views import Camera, PairBatch
+
+
+@given(pairs=st.integers(1, 40), size=st.integers(1, 7), batches=st.integers(1, 9))
+@settings(max_examples=30, deadline=None)
+def test_every_pass_visits_every_pair_once(pairs: int, size: int, batches: int) -> None:
+    sampler = PositionSampler(pairs, size, batches, seed=3)
+    seen = []
+    for epoch in range(1 + 2 * pairs // (size * batches)):
+        sampler.set_epoch(epoch)
+        seen += [item for batch in sampler for item in batch]
+    assert [position for position, _ in seen] == list(range(len(seen)))
+    for start in range(0, len(seen) - pairs + 1, pairs):
+        assert sorted(pair for _, pair in seen[start : start + pairs]) == list(range(pairs))
+
+
+def test_an_epoch_needs_no_history() -> None:
+    first, second = (PositionSampler(50, 4, 6, seed=1) for _ in range(2))
+    for epoch in range(3):
+        first.set_epoch(epoch)
+        batches = list(first)
+    second.set_epoch(2)
+    assert list(second) == batches
+
+
+def test_ranks_share_the_stream_without_overlap() -> None:
+    whole = PositionSampler(50, 4, 6, seed=1)
+    ranks = [PositionSampler(50, 4, 3, seed=1, rank=r, world=2) for r in range(2)]
+    both = [list(rank) for rank in ranks]
+    together = [batch for pair in zip(*both, strict=True) for batch in pair]
+    assert together == list(whole)
+
+
+def test_spread_reaches_both_ends() -> None:
+    assert spread(10, 4) == [0, 3, 6, 9]
+    assert spread(2, 9) == [0, 1]
+    assert spread(0, 3) == []
+
+
+def _example(batch: PairBatch) -> Example:
+    return Example(
+        batch.image[0],
+        batch.camera[0],
+        batch.reference_images[0],
+        batch.reference_cameras[0],
+        batch.reference_depths[0],
+    )
+
+
+def _batch(example: Example, like: PairBatch) -> PairBatch:
+    one = slice(0, 1)
+    return replace(
+        like,
+        image=example.image[None],
+        camera=_single(example.camera),
+        reference_images=example.reference_images[None],
+        reference_cameras=_single(example.reference_cameras),
+        reference_depths=example.reference_depths[None],
+        reference_valid=like.reference_valid[one],
+        warp=None,
+    )
+
+
+def _single(camera: Camera) -> Camera:
+    return replace(
+        camera, world_to_cam=camera.world_to_cam[None], intrinsics=camera.intrinsics[None]
+    )
+
+
+@pytest.fixture
+def wall_batch() -> PairBatch:
+    from diffusion.conftest import batch_of
+
+    return batch_of(1)
+
+
+def test_the_warp_of_the_mirror_is_the_mirror_of_the_warp(wall_batch: PairBatch) -> None:
+    example = _example(wall_batch)
+    plain = with_warp(_batch(example, wall_batch)).warp
+    mirror = with_warp(_batch(mirrored(example), wall_batch)).warp
+    assert plain is not None
+    assert mirror is not None
+    agree = (plain.mask == mirror.mask.flip(-1)).float().mean()
+    assert agree > 0.98
+    both = (plain.mask * mirror.mask.flip(-1))[:, None]
+    difference = ((plain.image - mirror.image.flip(-1)) * both).abs()
+    assert float(difference.mean()) < 2e-3
+
+
+def test_mirroring_twice_changes_nothing(wall_batch: PairBatch) -> None:
+    example = _example(wall_batch)
+    again = mirrored(mirrored(example))
+    torch.testing.assert_close(again.camera.world_to_cam, example.camera.world_to_cam)
+    torch.testing.assert_close(again.camera.intrinsics, example.camera.intrinsics)
+    assert torch.equal(again.image, example.image)
+    assert torch.linalg.det(mirrored(example).camera.world_to_cam) > 0

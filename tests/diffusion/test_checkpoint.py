@@ -1,0 +1,70 @@
+"""A saved model is a diffusers folder, loads strictly, and says in one line what does not fit."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from diffusers import DDIMScheduler, UNet2DConditionModel
+
+from extrap_train.config import ModelConfig
+from extrap_train.diffusion.checkpoint import load_model, save_model, start_weights
+from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.errors import InputError
+
+
+def test_a_model_comes_back_as_it_was(config: ModelConfig, tmp_path: Path) -> None:
+    model = ExtrapolationModel(config)
+    save_model(model, tmp_path / "model")
+    loaded = load_model(tmp_path / "model")
+    assert loaded.config == config
+    for (name, before), after in zip(
+        model.state_dict().items(), loaded.state_dict().values(), strict=True
+    ):
+        assert torch.equal(before, after), name
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["model"], "nothing half-written is left"
+
+
+def test_plain_diffusers_loads_the_folder(config: ModelConfig, tmp_path: Path) -> None:
+    model = ExtrapolationModel(config)
+    save_model(model, tmp_path / "model")
+    unet = UNet2DConditionModel.from_pretrained(tmp_path / "model" / "unet")
+    schedule = DDIMScheduler.from_pretrained(tmp_path / "model" / "scheduler")
+    assert torch.equal(unet.conv_in.weight, model.unet.conv_in.weight)
+    assert schedule.config.prediction_type == config.prediction
+    assert float(schedule.alphas_cumprod[-1]) == pytest.approx(0, abs=1e-6)
+
+
+def test_half_precision_on_disk_leaves_the_model_alone(
+    config: ModelConfig, tmp_path: Path
+) -> None:
+    model = ExtrapolationModel(config)
+    save_model(model, tmp_path / "model", torch.float16)
+    assert model.unet.conv_in.weight.dtype == torch.float32
+    loaded = load_model(tmp_path / "model").unet.conv_in.weight
+    assert loaded.dtype == torch.float32
+    torch.testing.assert_close(loaded, model.unet.conv_in.weight, atol=1e-3, rtol=1e-3)
+
+
+def test_weights_of_another_shape_are_refused(config: ModelConfig, tmp_path: Path) -> None:
+    save_model(ExtrapolationModel(config), tmp_path / "model")
+    other = ExtrapolationModel(replace(config, octaves=5))
+    with pytest.raises(InputError, match=r"does not fit the configured model.*conv_in"):
+        start_weights(other, str(tmp_path / "model"))
+
+
+@pytest.mark.parametrize("part", ["unet/diffusion_pytorch_model.safetensors", "image_encoder"])
+def test_a_damaged_folder_names_the_file(config: ModelConfig, tmp_path: Path, part: str) -> None:
+    save_model(ExtrapolationModel(config), tmp_path / "model")
+    path = tmp_path / "model" / part
+    if path.is_dir():
+        (path / "model.safetensors").unlink()
+    else:
+        path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(InputError, match=part):
+        load_model(tmp_path / "model")
+
+
+def test_an_unknown_start_lists_what_there_is(config: ModelConfig) -> None:
+    with pytest.raises(InputError, match=r"model\.start=nothing"):
+        start_weights(ExtrapolationModel(config), "nothing")

@@ -1,0 +1,59 @@
+"""A step is a function of its seed, moves every weight, and learns."""
+
+import torch
+
+from extrap_train.config import ModelConfig
+from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.training import diffusion_loss
+from extrap_train.views import PairBatch
+
+
+def _generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_the_loss_depends_on_the_seed_and_on_nothing_else(
+    config: ModelConfig, batch: PairBatch
+) -> None:
+    model = ExtrapolationModel(config)
+    first = diffusion_loss(model, batch, _generator(1), 0.1)
+    torch.rand(10)  # the global generator must not matter
+    assert torch.equal(first, diffusion_loss(model, batch, _generator(1), 0.1))
+    assert not torch.equal(first, diffusion_loss(model, batch, _generator(2), 0.1))
+
+
+def test_every_weight_receives_a_gradient(config: ModelConfig, batch: PairBatch) -> None:
+    model = ExtrapolationModel(config)
+    torch.nn.init.normal_(model.unet.conv_out.weight, std=0.1)
+    diffusion_loss(model, batch, _generator(0), 0.0).backward()
+    # With one token, softmax over keys is constant: queries and keys of cross-attention learn nothing.
+    idle = {n for n, p in model.named_parameters() if p.grad is None or not p.grad.any()}
+    assert all(".attn2.to_q." in n or ".attn2.to_k." in n or ".norm2." in n for n in idle), idle
+
+
+def test_without_a_condition_the_image_encoder_learns_nothing(
+    config: ModelConfig, batch: PairBatch
+) -> None:
+    model = ExtrapolationModel(config)
+    torch.nn.init.normal_(model.unet.conv_out.weight, std=0.1)
+    diffusion_loss(model, batch, _generator(0), 1.0).backward()
+    assert not any(p.grad is not None and p.grad.any() for p in model.image_encoder.parameters())
+
+
+def test_training_on_one_batch_lowers_its_loss(config: ModelConfig, batch: PairBatch) -> None:
+    """Measured on the same noise before and after, so that luck plays no part."""
+    torch.manual_seed(0)
+    model = ExtrapolationModel(config)
+    optimizer = torch.optim.Adam(model.parameters(), lr=3e-3)
+
+    def measured() -> float:
+        with torch.no_grad():
+            losses = [diffusion_loss(model, batch, _generator(1000 + i), 0.0) for i in range(8)]
+        return float(torch.stack(losses).mean())
+
+    before = measured()
+    for step in range(60):
+        optimizer.zero_grad()
+        diffusion_loss(model, batch, _generator(step), 0.0).backward()
+        optimizer.step()
+    assert measured() < 0.6 * before

@@ -1,0 +1,78 @@
+"""Imports point one way: geometry and views know nothing of depth and data, and those nothing of diffusion."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+_ROOT = Path(__file__).parents[1]
+_RANK = {
+    "extrap_train.errors": 0,
+    "extrap_train.config": 1,
+    "extrap_train.views": 1,
+    "extrap_train.geometry": 2,
+    "extrap_train.depth": 3,
+    "extrap_train.data": 3,
+    "extrap_train.metrics": 3,
+    "extrap_train.pictures": 4,
+    "extrap_train.diffusion": 5,
+    "extrap_train.runs": 5,
+    "data_prep": 7,
+    "benchmarks": 7,
+    "extrap_train.tasks": 8,
+    "extrap_train.cli": 9,
+}
+_ROOMS = sorted(_RANK, key=len, reverse=True)
+_FILES = sorted(
+    path
+    for room in ("extrap_train", "data_prep", "benchmarks")
+    for path in (_ROOT / room).rglob("*.py")
+)
+
+
+def _room(module: str) -> str | None:
+    return next((r for r in _ROOMS if module == r or module.startswith(f"{r}.")), None)
+
+
+def _module(path: Path) -> str:
+    parts = path.relative_to(_ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def _imports(path: Path) -> list[str]:
+    tree = ast.parse(path.read_text())
+    names = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            names.append(node.module or "")
+    return names
+
+
+@pytest.mark.parametrize("path", _FILES, ids=lambda path: str(path.relative_to(_ROOT)))
+def test_imports_point_one_way(path: Path) -> None:
+    module = _module(path)
+    if module.endswith("__main__"):
+        return
+    here = _room(module)
+    if here is None:
+        assert module == "extrap_train", f"{path} is in no room"
+        return
+    for name in _imports(path):
+        there = _room(name)
+        if there is not None and there != here:
+            assert _RANK[there] <= _RANK[here], f"{module} must not import {name}"
+
+
+@pytest.mark.parametrize("library", ["lightning", "hydra", "omegaconf"])
+def test_geometry_knows_neither_lightning_nor_hydra(library: str) -> None:
+    for path in _FILES:
+        if _module(path).startswith("extrap_train.geometry"):
+            assert not any(name.split(".")[0] == library for name in _imports(path)), path
+
+
+def test_every_file_is_short() -> None:
+    long = [str(p) for p in _FILES if len(p.read_text().splitlines()) > 350]
+    assert not long

@@ -1,0 +1,74 @@
+"""Metrics equal independent implementations and are fed the range that they declare."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from skimage.metrics import peak_signal_noise_ratio
+from torchmetrics.functional.image import structural_similarity_index_measure
+
+from extrap_train.errors import InputError
+from extrap_train.metrics import psnr, quantised, squeeze_lpips, ssim
+
+
+@pytest.fixture
+def images() -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    truth = torch.rand(3, 3, 32, 32, generator=generator)
+    noise = torch.randn(3, 3, 32, 32, generator=generator)
+    return (truth + 0.1 * noise).clamp(0, 1), truth
+
+
+def test_psnr_is_scikit_images(images: tuple[torch.Tensor, torch.Tensor]) -> None:
+    pairs = zip(*(i.numpy() for i in images), strict=True)
+    expected = [peak_signal_noise_ratio(t, p, data_range=1.0) for p, t in pairs]
+    np.testing.assert_allclose(psnr(*images), expected, atol=1e-4)
+
+
+def test_masked_psnr_sees_only_the_mask(images: tuple[torch.Tensor, torch.Tensor]) -> None:
+    prediction, truth = images
+    mask = torch.zeros(3, 32, 32)
+    mask[:, :10] = 1
+    inside = psnr(prediction[..., :10, :], truth[..., :10, :])
+    torch.testing.assert_close(psnr(prediction, truth, mask), inside)
+    assert psnr(prediction, truth, torch.zeros_like(mask)).isnan().all()
+
+
+def test_ssim_agrees_with_another_library(images: tuple[torch.Tensor, torch.Tensor]) -> None:
+    """torchmetrics pads differently: only the inside is the same, hence a mean within a percent."""
+    other = structural_similarity_index_measure(*images, data_range=1.0, reduction="none")
+    torch.testing.assert_close(ssim(*images), other, atol=0.01, rtol=0)
+
+
+def test_quantising_is_what_a_file_does(tmp_path: Path) -> None:
+    image = torch.rand(1, 3, 8, 8) * 1.2 - 0.1
+    pixels = (quantised(image)[0].permute(1, 2, 0) * 255).round().byte().numpy()
+    Image.fromarray(pixels).save(tmp_path / "x.png")
+    back = torch.from_numpy(np.array(Image.open(tmp_path / "x.png"))).float() / 255
+    torch.testing.assert_close(back.permute(2, 0, 1)[None], quantised(image))
+
+
+def test_lpips_gives_the_published_distances(shared: Path) -> None:
+    folder = shared / "weights"
+    distance = squeeze_lpips(str(folder / "lpips_squeeze.pt"))
+
+    def load(name: str) -> torch.Tensor:
+        pixels = np.asarray(Image.open(folder / name).convert("RGB"))
+        return torch.from_numpy(pixels.copy()).permute(2, 0, 1)[None].float() / 255
+
+    reference = load("ex_ref.png")
+    assert float(distance(load("ex_p0.png"), reference)) == pytest.approx(0.7110, abs=2e-4)
+    assert float(distance(load("ex_p1.png"), reference)) == pytest.approx(0.1479, abs=2e-4)
+
+
+def test_missing_lpips_weights_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    with pytest.raises(InputError, match=r"validation\.lpips_weights"):
+        squeeze_lpips(None)
+    with pytest.raises(InputError, match="no.pt"):
+        squeeze_lpips(str(tmp_path / "no.pt"))
+    (tmp_path / "bad.pt").write_bytes(b"nothing")
+    with pytest.raises(InputError, match="bad.pt"):
+        squeeze_lpips(str(tmp_path / "bad.pt"))
