@@ -65,7 +65,7 @@ def rays(camera: Camera) -> tuple[Tensor, Tensor]:
 
 def texture(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     """Colours that vary smoothly in space, in [0.1, 0.9]."""
-    waves = torch.tensor([[5.0, 3.0, 4.0], [-4.0, 6.0, 2.0], [3.0, -5.0, 6.0]], dtype=points.dtype)
+    waves = torch.tensor([[2.5, 1.5, 2.0], [-2.0, 3.0, 1.0], [1.5, -2.5, 3.0]], dtype=points.dtype)
     return 0.5 + 0.4 * torch.sin(
         points @ waves.T + torch.tensor([0.3, 1.1, 2.0], dtype=points.dtype)
     )

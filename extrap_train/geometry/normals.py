@@ -18,7 +18,7 @@ ALWAYS_SURFACE = 3.0
 """Tangent of the angle between viewing ray and normal up to which two neighbours always form a surface (72°)."""
 NEVER_SURFACE = 30.0
 """... and beyond which they never do (88°)."""
-LARGEST_BEND = 0.5
+LARGEST_BEND = 0.7
 """In between: change of slope to the next pair of pixels, as a share of the slope, that a surface may have."""
 
 
@@ -30,9 +30,11 @@ class Surface:
     """0 where depth is unknown."""
     slopes: Float[Tensor, "*b 4 h w"]
     """Towards the left, right, upper and lower neighbour, all counted along +u and +v; where there is no
-    connection, the opposite side's slope goes on."""
+    connection, the surface is continued from the opposite side."""
     connected: Bool[Tensor, "*b 4 h w"]
     """Whether that neighbour lies on the same surface."""
+    ends: Bool[Tensor, "*b 4 h w"]
+    """Whether the surface ends on that side, in front of another one."""
     valid: Bool[Tensor, "*b h w"]
     """Known depth, on a surface, and not just behind an occluding edge."""
 
@@ -51,8 +53,9 @@ def surface_from_depth(depth: Float[Tensor, "*b h w"], camera: Camera) -> Surfac
     slopes = [*across.slopes, *(slope.mT for slope in down.slopes)]
     connected = [*across.connected, *(link.mT for link in down.connected)]
     on_surface = (connected[0] | connected[1]) & (connected[2] | connected[3])
+    ends = [*across.ends, *(end.mT for end in down.ends)]
     valid = known & on_surface & ~across.behind & ~down.behind.mT
-    return Surface(inverse, torch.stack(slopes, -3), torch.stack(connected, -3), valid)
+    return Surface(inverse, *(torch.stack(sides, -3) for sides in (slopes, connected, ends)), valid)
 
 
 def normals_from_depth(
@@ -84,6 +87,7 @@ def plane_vectors(surface: Surface, camera: Camera) -> Float[Tensor, "*b h w 3"]
 class _Sides:
     slopes: tuple[Tensor, Tensor]
     connected: tuple[Tensor, Tensor]
+    ends: tuple[Tensor, Tensor]
     behind: Tensor
 
 
@@ -105,15 +109,29 @@ def _sides(
     jump = both & ~linked
     before, after = functional.pad(linked, (1, 0)), functional.pad(linked, (0, 1))
     to_before, to_after = functional.pad(slope, (1, 0)), functional.pad(slope, (0, 1))
-    behind = functional.pad(jump & (slope < 0), (1, 0)) | functional.pad(jump & (slope > 0), (0, 1))
+    rises, falls = jump & (slope > 0), jump & (slope < 0)
     return _Sides(
         slopes=(
-            torch.where(before, to_before, torch.where(after, to_after, 0)),
-            torch.where(after, to_after, torch.where(before, to_before, 0)),
+            torch.where(before, to_before, _continued(to_after, after, 1)),
+            torch.where(after, to_after, _continued(to_before, before, -1)),
         ),
         connected=(before, after),
-        behind=behind,
+        ends=(functional.pad(rises, (1, 0)), functional.pad(falls, (0, 1))),
+        behind=functional.pad(falls, (1, 0)) | functional.pad(rises, (0, 1)),
     )
+
+
+def _continued(
+    slope: Float[Tensor, "*b h w"], connected: Bool[Tensor, "*b h w"], inwards: int
+) -> Float[Tensor, "*b h w"]:
+    """The slope beyond the end of a surface: as it is just inside, changing on as it did there (at most twofold)."""
+    inner = torch.roll(slope, -inwards, -1)
+    known = connected & torch.roll(connected, -inwards, -1)
+    grown = torch.where(known, slope - inner, 0)
+    grown = torch.where(
+        grown * slope > 0, grown.sign() * torch.minimum(grown.abs(), slope.abs()), 0
+    )
+    return torch.where(connected, slope + grown, 0)
 
 
 def _least_bend(

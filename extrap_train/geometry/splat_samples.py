@@ -1,7 +1,6 @@
 """References cut into points dense enough that the query sees closed surfaces."""
 
-from dataclasses import dataclass
-from typing import Self
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -9,15 +8,22 @@ from torch import Tensor
 
 from extrap_train.geometry.cameras import pixel_grid
 from extrap_train.geometry.normals import Surface, plane_vectors, surface_from_depth
-from extrap_train.geometry.splat import ScreenPoints
+from extrap_train.geometry.splat_kernel import ScreenPoints
+from extrap_train.geometry.splat_projection import (
+    LEAST_DEPTH_RATIO,
+    project_pixels,
+    reference_to_query_pixels,
+    subdivide,
+)
+from extrap_train.geometry.splat_unseen import hidden_by_unseen
 from extrap_train.views import Camera
 
 LARGEST_SPACING = 1.05
 """Query pixels between neighbouring points of a surface: every pixel centre then lies well inside a footprint."""
+REACH_MARGIN = 0.03
+"""Query pixels by which neighbouring pieces of surface overlap, so that no seam shows what is behind."""
 MOST_POINTS = 8
 """Points per reference pixel along each axis: a surface stretched further is torn, it was hardly seen."""
-LEAST_DEPTH_RATIO = 1e-3
-"""Points that much nearer to the query than to the reference are not drawn: they would fill the image."""
 
 
 @dataclass(frozen=True)
@@ -42,11 +48,12 @@ def sample_surfaces(
     towards = plane_vectors(surface, cameras) * query_to_reference[..., None, None, :3, 3]
     drawn = surface.valid & (towards.sum(-1) < 1)
     matrix = reference_to_query_pixels(cameras, query)
-    counts = torch.where(drawn[..., None], _points_per_axis(surface, matrix), 0)
-    pixel, offset = _offsets(counts.reshape(-1, 2))
+    steps = _steps(surface, matrix)
+    counts = torch.where(drawn[..., None], _points_per_axis(steps), 0).reshape(-1, 2)
+    pixel, offset = subdivide(counts)
     corner = _Corner.around(surface, pixel, offset)
     inverse = surface.inverse_depth.reshape(-1)[pixel] + corner.steps(offset)
-    u, v, ratio = _project(
+    u, v, ratio = project_pixels(
         matrix.reshape(-1, 3, 4)[pixel // (h * w)],
         pixel % w + 0.5 + offset[:, 0],
         pixel // w % h + 0.5 + offset[:, 1],
@@ -54,65 +61,40 @@ def sample_surfaces(
     )
     inside = (u > -0.5) & (u < query.width + 0.5) & (v > -0.5) & (v < query.height + 0.5)
     seen = (inside & (inverse > 0) & (ratio > LEAST_DEPTH_RATIO)).nonzero()[:, 0]
-    values = corner.interpolate(maps.movedim(2, -1).reshape(-1, c), pixel, offset, seen)
-    image = (pixel // (k * h * w))[seen]
-    depth = ratio[seen] / inverse[seen]
-    return Samples(ScreenPoints(u[seen], v[seen], depth, image), values)
-
-
-def reference_to_query_pixels(cameras: Camera, query: Camera) -> Float[Tensor, "b k 3 4"]:
-    """The matrix from (u, v, 1, 1/z) of a reference pixel to the query's homogeneous pixel times z/z_query."""
-    reference_to_query = query.world_to_cam[:, None] @ cameras.cam_to_world
-    turned = reference_to_query[..., :3, :3] @ torch.linalg.inv(cameras.intrinsics)
-    moved = reference_to_query[..., :3, 3:]
-    return query.intrinsics[:, None] @ torch.cat([turned, moved], -1)
-
-
-def _project(
-    matrix: Float[Tensor, "*b 3 4"],
-    u: Float[Tensor, "*b"],
-    v: Float[Tensor, "*b"],
-    inverse: Float[Tensor, "*b"],
-) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b"], Float[Tensor, "*b"]]:
-    """Query pixel and query depth as a multiple of the reference's; meaningless where that is ≤ 0."""
-    x, y, ratio = (
-        matrix[..., i, 0] * u
-        + matrix[..., i, 1] * v
-        + matrix[..., i, 2]
-        + matrix[..., i, 3] * inverse
-        for i in range(3)
+    cells = steps.reshape(-1, 2, 2)[pixel[seen]] / counts[pixel[seen], :, None]
+    reach = (cells.abs().sum(1) / 2 + REACH_MARGIN).clamp(max=1)
+    points = ScreenPoints(
+        u[seen],
+        v[seen],
+        (ratio / inverse)[seen],
+        reach[:, 0],
+        reach[:, 1],
+        (pixel // (h * w))[seen],
     )
-    safe = torch.where(ratio > LEAST_DEPTH_RATIO, ratio, 1)
-    return x / safe, y / safe, ratio
+    kept = (~hidden_by_unseen(surface, matrix, cameras, query, points)).nonzero()[:, 0]
+    points = points[kept]
+    values = corner.interpolate(maps.movedim(2, -1).reshape(-1, c), pixel, offset, seen[kept])
+    return Samples(replace(points, image=points.image // k), values)
 
 
-def _points_per_axis(
-    surface: Surface, matrix: Float[Tensor, "b k 3 4"]
-) -> Int[Tensor, "b k h w 2"]:
-    """Points along u and v that keep their spacing in the query below `LARGEST_SPACING`."""
+def _steps(surface: Surface, matrix: Float[Tensor, "b k 3 4"]) -> Float[Tensor, "b k h w 2 2"]:
+    """How far (u, v) in the query moves for a step of one reference pixel along u, and along v."""
     h, w = surface.inverse_depth.shape[-2:]
     grid = pixel_grid(h, w, matrix.device).to(matrix.dtype)
     matrix = matrix[..., None, None, :, :]
-    u, v, ratio = _project(matrix, grid[..., 0], grid[..., 1], surface.inverse_depth)
+    u, v, ratio = project_pixels(matrix, grid[..., 0], grid[..., 1], surface.inverse_depth)
     left, right, up, low = surface.slopes.unbind(-3)
-    counts = []
+    steps = []
     for axis, slope in ((0, (left + right) / 2), (1, (up + low) / 2)):
         x, y, z = (matrix[..., i, axis] + slope * matrix[..., i, 3] for i in range(3))
-        step = torch.hypot(x - u * z, y - v * z) / ratio.clamp(min=LEAST_DEPTH_RATIO)
-        counts.append((step / LARGEST_SPACING).clamp(max=MOST_POINTS).ceil().clamp(min=1))
-    return torch.stack(counts, -1).long()
+        steps.append(torch.stack([x - u * z, y - v * z], -1))
+    return torch.stack(steps, -2) / ratio.clamp(min=LEAST_DEPTH_RATIO)[..., None, None]
 
 
-def _offsets(
-    counts: Int[Tensor, "n 2"],
-) -> tuple[Int[Tensor, "m"], Float[Tensor, "m 2"]]:
-    """Each point's pixel, and where in it the point lies: (u, v) from the centre, in (−½, ½)."""
-    total = counts[:, 0] * counts[:, 1]
-    pixel = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), total)
-    nth = torch.arange(len(pixel), device=counts.device) - (total.cumsum(0) - total)[pixel]
-    across, down = counts[pixel].unbind(-1)
-    column, row = nth % across, nth // across
-    return pixel, torch.stack([(column + 0.5) / across, (row + 0.5) / down], -1) - 0.5
+def _points_per_axis(steps: Float[Tensor, "b k h w 2 2"]) -> Int[Tensor, "b k h w 2"]:
+    """Points along u and v that keep their spacing in the query below `LARGEST_SPACING`."""
+    length = torch.linalg.vector_norm(steps.detach(), dim=-1)
+    return (length / LARGEST_SPACING).clamp(max=MOST_POINTS).ceil().clamp(min=1).long()
 
 
 @dataclass(frozen=True)
@@ -126,7 +108,7 @@ class _Corner:
     @classmethod
     def around(
         cls, surface: Surface, pixel: Int[Tensor, "m"], offset: Float[Tensor, "m 2"]
-    ) -> Self:
+    ) -> "_Corner":
         """Pick them by the signs of the offset."""
         h, w = surface.inverse_depth.shape[-2:]
         side = (offset > 0).long() + torch.tensor([0, 2], device=pixel.device)
