@@ -1,0 +1,107 @@
+"""Which captures are good enough to learn from (METHOD §6, paper III-A.1)."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from extrap_train.config import PrepConfig
+from extrap_train.data.sequences import Sequence
+from extrap_train.data.validation import is_degenerate
+from extrap_train.geometry.viewpoints import facing, fit_orbit, scene_center
+from extrap_train.views import Camera
+
+MIN_FRAMES = 8
+"""Fewer do not make a capture; two do, where a full circle is not asked for."""
+_FACING_RAD = math.radians(60)
+_MIN_FACING_SHARE = 0.9
+_MAX_ELEVATION_RAD = math.radians(75)
+"""Nearer to the orbit's pole an azimuth means nothing."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether a sequence is kept, and what was measured."""
+
+    kept: bool
+    reason: str
+    """Why it was dropped; empty where it was kept."""
+    frames: int
+    gap_deg: float = math.nan
+    """Largest azimuth gap within the covered arc; NaN where it was not measured."""
+    coverage_deg: float = math.nan
+    """360° less the arc's opening, which is the largest gap of all."""
+
+
+def judge(sequence: Sequence, options: PrepConfig) -> Verdict:
+    """Keep or drop a sequence; a quality that the capture does not state is no reason."""
+    count = len(sequence.frames)
+    least = MIN_FRAMES if options.full_circle_only else 2
+    if count < least:
+        return Verdict(False, f"{count} frames, fewer than {least}", count)
+    cameras = poses(sequence)
+    unsound = is_degenerate(cameras).nonzero().flatten().tolist()
+    if unsound:
+        name = sequence.frames[unsound[0]].name
+        return Verdict(
+            False, f"degenerate camera (NaN, no rotation, no focal length): {name}", count
+        )
+    facing_share = float(facing(cameras, scene_center(cameras), _FACING_RAD).mean())
+    gap, coverage = azimuth_coverage(cameras)
+    reasons = _quality_reasons(sequence, options)
+    if options.full_circle_only:
+        reasons += _circle_reasons(facing_share, gap, coverage, options)
+    return Verdict(not reasons, "; ".join(reasons), count, gap, coverage)
+
+
+def poses(sequence: Sequence) -> Camera:
+    """All cameras of a sequence as one batch, for their poses: the size is the first frame's."""
+    cameras = [frame.camera for frame in sequence.frames]
+    return Camera(
+        torch.stack([camera.world_to_cam for camera in cameras]),
+        torch.stack([camera.intrinsics for camera in cameras]),
+        cameras[0].height,
+        cameras[0].width,
+    )
+
+
+def azimuth_coverage(cameras: Camera) -> tuple[float, float]:
+    """Largest gap within the covered arc, and the arc itself, in degrees around the orbit."""
+    orbit = fit_orbit(cameras)
+    low = np.abs(orbit.elevations_rad) < _MAX_ELEVATION_RAD
+    gaps = _sorted_gaps_deg(orbit.azimuths_rad[low])
+    if len(gaps) < 2:
+        return 0.0, 0.0
+    return float(gaps[-2]), float(360 - gaps[-1])
+
+
+def _sorted_gaps_deg(azimuths_rad: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    azimuths = np.degrees(np.sort(azimuths_rad))
+    return np.sort(np.diff(azimuths, append=azimuths[:1] + 360))
+
+
+def _quality_reasons(sequence: Sequence, options: PrepConfig) -> list[str]:
+    scores = (
+        ("viewpoint", sequence.viewpoint_quality, options.min_viewpoint_quality),
+        ("point cloud", sequence.point_cloud_quality, options.min_point_cloud_quality),
+    )
+    return [
+        f"{name} quality {score:.2f} < {least:g}"
+        for name, score, least in scores
+        if score is not None and not score >= least
+    ]
+
+
+def _circle_reasons(
+    facing_share: float, gap_deg: float, coverage_deg: float, options: PrepConfig
+) -> list[str]:
+    reasons = []
+    if facing_share < _MIN_FACING_SHARE:
+        reasons.append(f"only {facing_share:.0%} of the cameras face a common centre")
+    if coverage_deg < options.min_coverage_deg:
+        reasons.append(f"covers {coverage_deg:.0f}° < {options.min_coverage_deg:g}°")
+    if gap_deg > options.max_gap_deg:
+        reasons.append(f"azimuth gap {gap_deg:.0f}° > {options.max_gap_deg:g}°")
+    return reasons

@@ -1,0 +1,88 @@
+"""From one capture's photographs to square frames with depth, at the store's size."""
+
+import hashlib
+import json
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from extrap_train.data.frame_files import SequenceFrames
+from extrap_train.data.sequences import Sequence
+from extrap_train.depth import DepthSource
+from extrap_train.errors import InputError
+from extrap_train.views import View, stack_cameras
+
+
+def frames_key(sequence: Sequence, depth_source: DepthSource, image_size: int) -> str:
+    """A hash of what frames are made from: options, names and cameras, not the files' bytes."""
+    digest = hashlib.sha256(json.dumps([image_size, repr(depth_source)]).encode())
+    for frame in sequence.frames:
+        traits = [frame.name, frame.camera.height, frame.camera.width, frame.has_depth]
+        digest.update(json.dumps([*traits, frame.has_mask]).encode())
+        digest.update(frame.camera.world_to_cam.numpy(force=True).tobytes())
+        digest.update(frame.camera.intrinsics.numpy(force=True).tobytes())
+    return digest.hexdigest()
+
+
+def make_frames(sequence: Sequence, depth_source: DepthSource, image_size: int) -> SequenceFrames:
+    """Read a sequence as squares around the object, with depth, at the store's size.
+
+    Raises InputError where a file cannot be used, no mask shows the object, or no depth is known
+    at all.
+    """
+    working_size = max(image_size, depth_source.image_size or 0)
+    views = [object_square(frame.load(), working_size) for frame in sequence.frames]
+    where = f"sequence {sequence.category}/{sequence.name}"
+    if all(view.mask is not None and not view.mask.any() for view in views):
+        raise InputError(f"{where}: the masks are all black; remove them or the sequence")
+    maps = depth_source.depth_maps(views)
+    views = [
+        replace(view, depth=found.reliable()).resized(image_size, image_size)
+        for view, found in zip(views, maps, strict=True)
+    ]
+    frames = SequenceFrames(
+        names=tuple(frame.name for frame in sequence.frames),
+        camera=stack_cameras([view.camera for view in views]),
+        images=np.stack([_to_bytes(view.image).transpose(1, 2, 0) for view in views]),
+        depths=np.stack([_known(view.depth) for view in views]),
+        masks=np.stack([_to_bytes(_mask(view)) for view in views]),
+    )
+    if not frames.depths.any():
+        raise InputError(f"{where}: no depth is known in any of its frames; use depth=stereo")
+    return frames
+
+
+def object_square(view: View, size: int) -> View:
+    """The largest square inside the image, as near to the object as it gets, resampled."""
+    height, width = view.camera.height, view.camera.width
+    side = min(height, width)
+    v, u = _object_middle(view)
+    top = min(max(round(v - side / 2), 0), height - side)
+    left = min(max(round(u - side / 2), 0), width - side)
+    return view.cropped(top, left, side, side).resized(size, size)
+
+
+def _object_middle(view: View) -> tuple[float, float]:
+    """(v, u) of the middle of the mask's bounding box; without an object, of the image."""
+    inside = torch.zeros(0, 2) if view.mask is None else (view.mask > 0.5).nonzero().float()
+    if not len(inside):
+        return view.camera.height / 2, view.camera.width / 2
+    v, u = (inside.amin(0) + inside.amax(0) + 1) / 2
+    return float(v), float(u)
+
+
+def _mask(view: View) -> Float[Tensor, "h w"]:
+    return torch.ones_like(view.image[0]) if view.mask is None else view.mask
+
+
+def _known(depth: Float[Tensor, "h w"] | None) -> Float[np.ndarray, "h w"]:
+    assert depth is not None
+    values = depth.numpy(force=True).astype(np.float32)
+    return np.where(np.isfinite(values) & (values > 0), values, 0)
+
+
+def _to_bytes(values: Float[Tensor, "*n"]) -> np.ndarray:
+    return (values.clamp(0, 1) * 255).round().byte().numpy(force=True)

@@ -1,0 +1,88 @@
+"""What is trained on and what is tested on (METHOD §6)."""
+
+import hashlib
+import json
+from collections import defaultdict
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool
+
+from extrap_train.errors import InputError
+
+HELD_OUT_EVERY = 5
+"""A lone sequence holds out every fifth frame."""
+
+
+@dataclass(frozen=True)
+class Split:
+    """Sequences, as `category/name`, by what they are for."""
+
+    train: tuple[str, ...]
+    test: tuple[str, ...]
+    lone: tuple[str, ...]
+    """The only usable sequence of its category: trained on, with frames held out for testing."""
+
+    def role(self, sequence: str) -> str:
+        """`train`, `test` or `train and test`."""
+        if sequence in self.lone:
+            return "train and test"
+        return "test" if sequence in self.test else "train"
+
+    def to_json(self) -> str:
+        """The split as a file's content, with a hash of it."""
+        content = {
+            "train": self.train,
+            "test": self.test,
+            "lone": {name: {"held_out_every": HELD_OUT_EVERY} for name in self.lone},
+        }
+        digest = hashlib.sha256(json.dumps(content).encode()).hexdigest()
+        return json.dumps({**content, "sha256": digest}, indent=1) + "\n"
+
+
+def split_sequences(sequences: Sequence[str], test: Collection[str] | int) -> Split:
+    """Divide every category's sequences (`category/name`).
+
+    `test` names the test sequences (by name, or with the category), or says how many a category
+    gives: those whose names have the smallest hashes, and never more than half. Raises InputError
+    where nothing is left to train on.
+    """
+    members: dict[str, list[str]] = defaultdict(list)
+    for sequence in sorted(sequences):
+        members[sequence.split("/", 1)[0]].append(sequence)
+    tested: list[str] = []
+    lone: list[str] = []
+    for category, names in members.items():
+        if len(names) == 1:
+            lone += names
+        elif isinstance(test, int):
+            tested += sorted(names, key=_hash)[: min(test, len(names) // 2)]
+        else:
+            tested += _named(category, names, test)
+    train = tuple(s for s in sorted(sequences) if s not in {*tested, *lone})
+    return Split(train, tuple(sorted(tested)), tuple(lone))
+
+
+def held_out(frames: int) -> Bool[np.ndarray, "n"]:
+    """Which frames of a lone sequence are for testing."""
+    return np.arange(frames) % HELD_OUT_EVERY == HELD_OUT_EVERY - 1
+
+
+def _named(category: str, names: list[str], test: Collection[str]) -> list[str]:
+    chosen = [name for name in names if name in test or name.split("/", 1)[1] in test]
+    if len(chosen) == len(names):
+        raise InputError(
+            f"{category}: all {len(names)} usable sequences are named as test sequences, none is "
+            "left to train on; add sequences or name fewer"
+        )
+    if not chosen:
+        raise InputError(
+            f"{category}: none of the {len(test)} named test sequences is among the {len(names)} "
+            "usable ones; name others or give their number instead"
+        )
+    return chosen
+
+
+def _hash(name: str) -> str:
+    return hashlib.sha256(name.encode()).hexdigest()

@@ -1,0 +1,103 @@
+"""The folder of one prepared sequence: what is in it, and how it gets there whole or not at all."""
+
+import math
+import re
+import shutil
+import tempfile
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from jaxtyping import Float, UInt8
+
+from extrap_train.views import Camera
+
+IMAGES, DEPTHS, MASKS, CAMERAS = "images.npy", "depth.npy", "mask.npy", "frames.parquet"
+_KEY = b"key"
+_SAFE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}")
+
+
+@dataclass(frozen=True)
+class SequenceFrames:
+    """All frames of one sequence at the store's size."""
+
+    names: tuple[str, ...]
+    camera: Camera
+    images: UInt8[np.ndarray, "n h w 3"]
+    depths: Float[np.ndarray, "n h w"]
+    masks: UInt8[np.ndarray, "n h w"]
+    """255 is the object; 255 everywhere where the capture has no mask."""
+
+
+def frames_folder(root: Path, sequence: str) -> Path:
+    """Where the frames of `category/name` lie; both are untrusted and never lead out of `root`."""
+    return root.joinpath("frames", *(_safe(part) for part in sequence.split("/", 1)))
+
+
+def write_frames(folder: Path, frames: SequenceFrames, key: str) -> None:
+    """Write a sequence's folder, whole or not at all; `key` says what it was made from.
+
+    Depth is stored as float16, divided by a power of two near its median: exact for every scene
+    unit, relative precision 2⁻¹¹; what is more than 65,504 medians away becomes unknown.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".tmp", dir=folder.parent))
+    try:
+        scale = _depth_scale(frames.depths)
+        scaled = frames.depths / scale
+        scaled[scaled > np.finfo(np.float16).max] = 0
+        np.save(temporary / IMAGES, frames.images)
+        np.save(temporary / DEPTHS, scaled.astype(np.float16))
+        np.save(temporary / MASKS, frames.masks)
+        pq.write_table(_camera_table(frames, scale, key), temporary / CAMERAS)
+        temporary.chmod(0o755)  # mkdtemp's folders are closed to everyone else
+        if folder.exists():
+            shutil.rmtree(folder)
+        temporary.rename(folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def read_camera_table(folder: Path, key: str) -> pa.Table | None:
+    """One row a frame, if the folder holds a whole sequence made from what `key` says."""
+    try:
+        table = pq.read_table(folder / CAMERAS)
+    except (OSError, pa.ArrowInvalid):
+        return None
+    complete = all((folder / name).is_file() for name in (IMAGES, DEPTHS, MASKS))
+    made_from = (table.schema.metadata or {}).get(_KEY, b"").decode()
+    return table if complete and made_from == key else None
+
+
+def _camera_table(frames: SequenceFrames, depth_scale: float, key: str) -> pa.Table:
+    count = len(frames.names)
+    columns = {
+        "index": pa.array(range(count), pa.int32()),
+        "name": pa.array(frames.names, pa.string()),
+        "world_to_cam": _matrices(frames.camera.world_to_cam.numpy(force=True)),
+        "intrinsics": _matrices(frames.camera.intrinsics.numpy(force=True)),
+        "depth_share": pa.array((frames.depths > 0).mean((1, 2)), pa.float32()),
+        "depth_scale": pa.array([depth_scale] * count, pa.float32()),
+    }
+    return pa.table(columns).replace_schema_metadata({_KEY: key.encode()})
+
+
+def _matrices(matrices: Float[np.ndarray, "n r c"]) -> pa.Array:
+    values = pa.array(matrices.astype(np.float32).reshape(-1))
+    return pa.FixedSizeListArray.from_arrays(values, matrices.shape[1] * matrices.shape[2])
+
+
+def _depth_scale(depths: Float[np.ndarray, "n h w"]) -> float:
+    known = depths[depths > 0]
+    return 2.0 ** round(math.log2(float(np.median(known)))) if known.size else 1.0
+
+
+def _safe(part: str) -> str:
+    """A file name for an untrusted name: itself where harmless, else a slug with a digest."""
+    if _SAFE_NAME.fullmatch(part):
+        return part
+    slug = re.sub(r"[^A-Za-z0-9_-]+", "_", part)[:40]
+    return f"{slug or 'unnamed'}-{sha256(part.encode(errors='surrogatepass')).hexdigest()[:12]}"

@@ -1,0 +1,191 @@
+"""Prepared data on disk, as training reads it: pairs, cameras, and memory-mapped frames.
+
+<folder>/manifest.json       what it was made from; written last: marks a finished preparation
+         sequences.parquet   a row a sequence, the dropped ones too, with reasons
+         frames.parquet      a row a frame: name, camera, whether it may serve as a reference
+         pairs.parquet       a row an ordered pair (reference → query)
+         split.json          test sequences (or frames), with a hash
+         frames/<category>/<sequence>/{images,depth,mask}.npy, frames.parquet
+"""
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from extrap_train.data.frame_files import DEPTHS, IMAGES, MASKS, frames_folder
+from extrap_train.errors import InputError
+from extrap_train.views import Camera, ViewPair
+
+FORMAT = 1
+_OPEN_SEQUENCES = 128
+"""Sequences whose files stay open: three descriptors each, and a process has about a thousand."""
+
+Arrays = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """The pairs of one split as columns; an item or an iteration gives `ViewPair`s."""
+
+    sequence: np.ndarray
+    query: Int[np.ndarray, "m"]
+    reference: Int[np.ndarray, "m"]
+    angle_rad: Float[np.ndarray, "m"]
+    score: Float[np.ndarray, "m"]
+
+    def __len__(self) -> int:
+        return len(self.query)
+
+    def __getitem__(self, index: int) -> ViewPair:
+        references = (int(self.reference[index]),)
+        score = float(self.score[index])
+        return ViewPair(str(self.sequence[index]), int(self.query[index]), references, score)
+
+    def __iter__(self) -> Iterator[ViewPair]:
+        return (self[index] for index in range(len(self)))
+
+
+class PreparedData:
+    """One prepared folder. Sequences are named `category/name`; safe to use across processes."""
+
+    def __init__(
+        self,
+        folder: Path,
+        manifest: dict[str, Any],
+        sequences: pd.DataFrame,
+        frames: pa.Table,
+        pairs: pd.DataFrame,
+    ) -> None:
+        self.folder = folder
+        self.manifest = manifest
+        self.sequences = sequences
+        """A row a sequence: name, verdict with reason and measurements, split, number of pairs."""
+        self.image_size: int = manifest["options"]["image_size"]
+        self._pairs = pairs
+        self._world_to_cam = matrices_of(frames, "world_to_cam", (4, 4))
+        self._intrinsics = matrices_of(frames, "intrinsics", (3, 3))
+        self._depth_scale = frames["depth_scale"].to_numpy()
+        self._reference = frames["reference"].to_numpy()
+        self._names = frames["name"]
+        self._rows = _row_ranges(frames["sequence"].to_numpy())
+        self._arrays: Callable[[str], Arrays] = lru_cache(_OPEN_SEQUENCES)(self._open_arrays)
+
+    @classmethod
+    def open(cls, folder: Path) -> "PreparedData":
+        """Open a finished preparation; raises InputError where it is missing or damaged."""
+        manifest = read_manifest(folder)
+        tables = {name: _read_table(folder, name) for name in ("sequences", "frames", "pairs")}
+        try:
+            return cls(
+                folder,
+                manifest,
+                tables["sequences"].to_pandas(),
+                tables["frames"],
+                tables["pairs"].to_pandas(),
+            )
+        except (KeyError, ValueError) as error:
+            raise _damaged(folder, f"a column is missing or odd: {error}") from None
+
+    def pairs(self, split: str) -> Pairs:
+        """The pairs of `train` or `test`, sequence by sequence, best score first."""
+        if split not in ("train", "test"):
+            raise ValueError(f"split is train or test, not {split!r}")
+        rows = self._pairs[self._pairs["split"] == split]
+        names = ("sequence", "query", "reference", "angle_rad", "score")
+        return Pairs(*(rows[name].to_numpy() for name in names))
+
+    def cameras(self, sequence: str) -> Camera:
+        """All cameras of a sequence, at the store's image size."""
+        rows = self._rows[sequence]
+        size = self.image_size
+        return Camera(self._world_to_cam[rows], self._intrinsics[rows], size, size)
+
+    def names(self, sequence: str) -> list[str]:
+        """The frames' names, in their order."""
+        return self._names[self._rows[sequence]].to_pylist()
+
+    def reference_frames(self, sequence: str) -> Int[np.ndarray, "m"]:
+        """The frames that may serve as references: not held out, and with some depth known."""
+        return np.flatnonzero(self._reference[self._rows[sequence]])
+
+    def frames(
+        self, sequence: str, indices: Sequence[int]
+    ) -> tuple[Float[Tensor, "k 3 h w"], Float[Tensor, "k h w"], Float[Tensor, "k h w"]]:
+        """Images, depths and object masks of some frames."""
+        images, depths, masks = self._arrays(sequence)
+        chosen = list(indices)
+        scale = float(self._depth_scale[self._rows[sequence].start])
+        return (
+            torch.from_numpy(images[chosen]).permute(0, 3, 1, 2).contiguous().float().div_(255),
+            torch.from_numpy(depths[chosen]).float().mul_(scale),
+            torch.from_numpy(masks[chosen]).float().div_(255),
+        )
+
+    def _open_arrays(self, sequence: str) -> Arrays:
+        folder = frames_folder(self.folder, sequence)
+        count = self._rows[sequence].stop - self._rows[sequence].start
+        square = (count, self.image_size, self.image_size)
+        try:
+            images, depths, masks = (
+                np.load(folder / name, mmap_mode="r") for name in (IMAGES, DEPTHS, MASKS)
+            )
+        except (OSError, ValueError, EOFError) as error:
+            raise _damaged(self.folder, f"{folder}: {error}") from None
+        if images.shape != (*square, 3) or depths.shape != square or masks.shape != square:
+            raise _damaged(self.folder, f"{folder}: frames are not {square}")
+        return images, depths, masks
+
+    def __reduce__(self) -> tuple[Callable[[Path], "PreparedData"], tuple[Path]]:
+        """In another process the folder is opened anew: a pickled memory map would be a copy."""
+        return PreparedData.open, (self.folder,)
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """What a folder was prepared from; raises InputError where that is missing or damaged."""
+    file = folder / "manifest.json"
+    try:
+        manifest = json.loads(file.read_bytes())
+    except FileNotFoundError:
+        raise InputError(f"{folder}: holds no finished preparation; run data_prep again") from None
+    except (OSError, ValueError) as error:
+        raise _damaged(folder, f"{file}: {error}") from None
+    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+        raise _damaged(folder, f"{file} is not a manifest of format {FORMAT}")
+    return manifest
+
+
+def _read_table(folder: Path, name: str) -> pa.Table:
+    file = folder / f"{name}.parquet"
+    try:
+        return pq.read_table(file).combine_chunks()
+    except (OSError, pa.ArrowInvalid) as error:
+        reason = str(error).splitlines()[0]
+        raise _damaged(folder, f"{file}: {reason}") from None
+
+
+def _damaged(folder: Path, what: str) -> InputError:
+    return InputError(f"{folder} is damaged ({what}); delete that folder and run data_prep again")
+
+
+def matrices_of(table: pa.Table, column: str, shape: tuple[int, int]) -> Float[Tensor, "n r c"]:
+    """A column of flattened matrices as a tensor."""
+    values = table[column].combine_chunks().flatten().to_numpy()
+    return torch.from_numpy(np.array(values, np.float32).reshape(-1, *shape))
+
+
+def _row_ranges(sequences: np.ndarray) -> dict[str, slice]:
+    """Where each sequence's rows lie; a sequence's rows are together."""
+    starts = np.flatnonzero(np.r_[True, sequences[1:] != sequences[:-1]])
+    stops = [*starts[1:], len(sequences)]
+    return {str(sequences[a]): slice(int(a), int(b)) for a, b in zip(starts, stops, strict=True)}

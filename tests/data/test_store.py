@@ -1,0 +1,165 @@
+import json
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from orbits import capture, even, ring
+
+from data_prep.build import prepare
+from extrap_train.config import PrepConfig
+from extrap_train.data.frame_files import (
+    SequenceFrames,
+    frames_folder,
+    read_camera_table,
+    write_frames,
+)
+from extrap_train.data.store import PreparedData
+from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.errors import InputError
+
+SIZE = 16
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    sequences = [capture(ring(even(24)), name, depth=2.5) for name in ("a", "b", "c", "d")]
+    target = tmp_path_factory.mktemp("store") / "cup"
+    options = PrepConfig(image_size=SIZE)
+    prepare(sequences, DatasetDepth(), options, test_names={"c"}, folder=target, progress=False)
+    return target
+
+
+def test_frames_come_as_they_went_in(folder: Path) -> None:
+    data = PreparedData.open(folder)
+    images, depths, masks = data.frames("cup/b", [5, 0, 23])
+    assert images.shape == (3, 3, SIZE, SIZE)
+    assert images.is_contiguous()
+    np.testing.assert_allclose(images[:, 0, 0, 0], [5 / 24, 0, 23 / 24], atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(depths, 2.5, rtol=2**-11)
+    assert (masks == 1).all()  # a capture without masks
+    assert data.names("cup/b")[5] == "frame5"
+
+
+def test_cameras_are_those_of_the_square_frames(folder: Path) -> None:
+    camera = PreparedData.open(folder).cameras("cup/a")
+    expected = ring(even(24)).cropped(0, 8, 48, 48).resized(SIZE, SIZE)
+    torch.testing.assert_close(camera.world_to_cam, expected.world_to_cam)
+    torch.testing.assert_close(camera.intrinsics, expected.intrinsics)
+    assert (camera.height, camera.width) == (SIZE, SIZE)
+
+
+def test_pairs_stay_within_their_split(folder: Path) -> None:
+    data = PreparedData.open(folder)
+    train, test = data.pairs("train"), data.pairs("test")
+    assert {pair.sequence for pair in train} == {"cup/a", "cup/b", "cup/d"}
+    assert {pair.sequence for pair in test} == {"cup/c"}
+    assert len(train) == len(list(train)) == 3 * len(test)
+    angle = train.angle_rad[0]
+    assert train[0].score == pytest.approx(np.cos(angle) * (1 - np.cos(angle)))
+    with pytest.raises(ValueError, match="train or test"):
+        data.pairs("validation")
+
+
+def test_another_process_gets_the_folder_not_the_frames(folder: Path) -> None:
+    data = PreparedData.open(folder)
+    data.frames("cup/a", [0])
+    content = pickle.dumps(data)
+    assert len(content) < 1000
+    assert len(pickle.loads(content).pairs("train")) == len(data.pairs("train"))
+
+
+@given(exponent=st.floats(-12, 12), seed=st.integers(0, 99))
+@settings(max_examples=30, deadline=None)
+def test_depth_survives_in_any_unit(exponent: float, seed: int, tmp_path_factory) -> None:
+    rng = np.random.default_rng(seed)
+    depths = (rng.uniform(0.2, 50, (2, 4, 4)) * 10**exponent).astype(np.float32)
+    depths[0, 0, 0] = 0
+    target = tmp_path_factory.mktemp("unit") / "one"
+    bytes_ = np.zeros((2, 4, 4), np.uint8)
+    camera = ring(even(2))
+    frames = SequenceFrames(("x", "y"), camera, np.stack([bytes_] * 3, -1), depths, bytes_)
+    write_frames(target, frames, "key")
+    table = read_camera_table(target, "key")
+    assert table is not None
+    stored = np.load(target / "depth.npy").astype(np.float32) * table["depth_scale"][0].as_py()
+    np.testing.assert_allclose(stored, depths, rtol=2**-11)
+    assert read_camera_table(target, "another key") is None
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../../etc/x",
+        "/abs/x",
+        "cup/../..",
+        "cup/..",
+        "cup/a/../../b",
+        "cup/\0",
+        "cup/" + "x" * 300,
+        "/",
+    ],
+)
+def test_untrusted_names_stay_inside(name: str, tmp_path: Path) -> None:
+    folder = frames_folder(tmp_path, name)
+    assert (tmp_path / "frames") in folder.resolve().parents
+    assert all(len(part) <= 100 for part in folder.parts)
+
+
+def test_names_that_look_alike_as_files_stay_apart(tmp_path: Path) -> None:
+    assert frames_folder(tmp_path, "cup/a b") != frames_folder(tmp_path, "cup/a_b")
+    assert frames_folder(tmp_path, "cup/a b") != frames_folder(tmp_path, "cup/a/b")
+    assert frames_folder(tmp_path, "cup/0003") == tmp_path / "frames" / "cup" / "0003"
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "pairs.parquet", "frames.parquet"])
+@pytest.mark.parametrize("content", [b"", b"garbage", b"{}"])
+def test_damage_is_one_line(folder: Path, name: str, content: bytes) -> None:
+    file = folder / name
+    whole = file.read_bytes()
+    file.write_bytes(content)
+    try:
+        with pytest.raises(InputError, match="damaged") as caught:
+            PreparedData.open(folder)
+    finally:
+        file.write_bytes(whole)
+    assert str(folder) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_column_is_damage(folder: Path) -> None:
+    import pyarrow.parquet as pq
+
+    file = folder / "frames.parquet"
+    whole = pq.read_table(file)
+    pq.write_table(whole.drop_columns(["intrinsics"]), file)
+    try:
+        with pytest.raises(InputError, match=r"damaged.*intrinsics"):
+            PreparedData.open(folder)
+    finally:
+        pq.write_table(whole, file)
+
+
+def test_a_truncated_frame_file_is_damage(folder: Path) -> None:
+    file = folder / "frames" / "cup" / "d" / "depth.npy"
+    whole = file.read_bytes()
+    file.write_bytes(whole[:1000])
+    try:
+        with pytest.raises(InputError, match="damaged"):
+            PreparedData.open(folder).frames("cup/d", [0])
+    finally:
+        file.write_bytes(whole)
+
+
+def test_an_unfinished_preparation_says_so(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no finished preparation"):
+        PreparedData.open(tmp_path)
+
+
+def test_the_manifest_states_what_it_was_made_from(folder: Path) -> None:
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert manifest["options"]["image_size"] == SIZE
+    assert manifest["sequences"] == {"kept": 4, "dropped": 0}

@@ -1,0 +1,189 @@
+import errno
+import logging
+import os
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from orbits import capture, even, ring
+
+from data_prep import build
+from data_prep.build import prepare
+from data_prep.frames import object_square
+from extrap_train.config import PrepConfig
+from extrap_train.data.store import PreparedData
+from extrap_train.depth import DepthMap, DepthSource
+from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.errors import InputError
+from extrap_train.views import View
+
+OPTIONS = PrepConfig(image_size=16)
+
+
+@dataclass(frozen=True)
+class CountingDepth(DatasetDepth):
+    """Depth of the data set, with a record of the sequences it was asked for."""
+
+    calls: tuple[list[int], ...] = ([],)
+
+    def __repr__(self) -> str:
+        return "CountingDepth()"
+
+    def depth_maps(self, views: ListOf[View]) -> list[DepthMap]:
+        self.calls[0].append(len(views))
+        return super().depth_maps(views)
+
+
+def run(folder: Path, sequences, test_names=2, depth: DepthSource | None = None, options=OPTIONS):
+    return prepare(
+        sequences,
+        depth or DatasetDepth(),
+        options,
+        test_names=test_names,
+        folder=folder,
+        workers=2,
+        progress=False,
+    )
+
+
+def captures(count: int, **traits):
+    return [capture(ring(even(24)), f"{index:04d}", **traits) for index in range(count)]
+
+
+def test_a_second_run_does_nothing_and_says_so(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    depth = CountingDepth(calls=([],))
+    first = run(tmp_path / "cup", captures(3), depth=depth)
+    before = {p: p.stat().st_mtime_ns for p in (tmp_path / "cup").rglob("*")}
+    with caplog.at_level(logging.INFO):
+        second = run(tmp_path / "cup", captures(3), depth=depth)
+    assert len(depth.calls[0]) == 3
+    assert before == {p: p.stat().st_mtime_ns for p in (tmp_path / "cup").rglob("*")}
+    assert "prepared already" in caplog.text
+    assert first.manifest == second.manifest
+
+
+def test_other_pair_options_keep_the_frames_other_sizes_do_not(tmp_path: Path) -> None:
+    depth = CountingDepth(calls=([],))
+    many = run(tmp_path / "cup", captures(3), depth=depth)
+    few = run(tmp_path / "cup", captures(3), depth=depth, options=replace(OPTIONS, max_uses=2))
+    assert len(few.pairs("train")) < len(many.pairs("train"))
+    assert len(depth.calls[0]) == 3
+    large = run(tmp_path / "cup", captures(3), depth=depth, options=PrepConfig(image_size=20))
+    assert large.frames("cup/0001", [0])[0].shape == (1, 3, 20, 20)
+    assert len(depth.calls[0]) == 6
+
+
+def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    depth = CountingDepth(calls=([],))
+
+    def interrupt() -> View:
+        raise KeyboardInterrupt
+
+    sequences = captures(3)
+    frames = (replace(sequences[2].frames[0], load=interrupt), *sequences[2].frames[1:])
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "cup", [*sequences[:2], replace(sequences[2], frames=frames)], depth=depth)
+    with pytest.raises(InputError, match="no finished preparation"):
+        PreparedData.open(tmp_path / "cup")
+    data = run(tmp_path / "cup", sequences, depth=depth)
+    assert len(depth.calls[0]) == 3
+    fresh = run(tmp_path / "fresh", sequences)
+    assert fresh.manifest["pairs"] == data.manifest["pairs"]
+
+
+def test_two_runs_give_the_same_files(tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        run(tmp_path / name, captures(3))
+    for file in (tmp_path / "one").rglob("*.*"):
+        twin = tmp_path / "two" / file.relative_to(tmp_path / "one")
+        assert file.is_dir() or file.read_bytes() == twin.read_bytes()
+
+
+def test_a_failing_sequence_is_reported_and_the_rest_goes_on(tmp_path: Path) -> None:
+    sequences = [*captures(3), capture(ring(even(24)), "bad", broken=4)]
+    sequences += [capture(ring(even(24, 90)), "arc"), capture(ring(even(24)), "flat", depth=0.0)]
+    black = lambda index: torch.zeros(48, 64)  # noqa: E731
+    sequences += [capture(ring(even(24)), "black", mask=black)]
+    data = run(tmp_path / "cup", sequences)
+    reasons = data.sequences.set_index("sequence")["reason"]
+    assert reasons["cup/bad"] == "bad/frame4.jpg: truncated; restore it"
+    assert "covers 86°" in reasons["cup/arc"]
+    assert "no depth is known" in reasons["cup/flat"]
+    assert "masks are all black" in reasons["cup/black"]
+    assert data.sequences["kept"].sum() == 3
+    assert {pair.sequence for pair in data.pairs("train")} <= {f"cup/000{i}" for i in range(3)}
+
+
+def test_nothing_left_sums_up_the_reasons(tmp_path: Path) -> None:
+    arcs = [capture(ring(even(24, 90)), str(i)) for i in range(3)]
+    with pytest.raises(InputError, match=r"none of the 3 sequences of cup.*3 times covers 86°"):
+        run(tmp_path / "cup", arcs)
+    with pytest.raises(InputError, match="no sequence to prepare"):
+        run(tmp_path / "cup", [])
+
+
+def test_a_nan_camera_drops_its_sequence(tmp_path: Path) -> None:
+    camera = ring(even(24))
+    camera.world_to_cam[3] = float("nan")
+    data = run(tmp_path / "cup", [*captures(2), capture(camera, "nan")])
+    assert "frame3" in data.sequences.set_index("sequence").loc["cup/nan", "reason"]
+
+
+def test_a_lone_sequence_holds_frames_out(tmp_path: Path) -> None:
+    data = run(tmp_path / "cup", captures(1))
+    held = {4, 9, 14, 19}
+    train, test = data.pairs("train"), data.pairs("test")
+    assert not held & {*train.query.tolist(), *train.reference.tolist()}
+    assert set(test.query.tolist()) == held
+    assert not held & set(test.reference.tolist())
+    assert not held & set(data.reference_frames("cup/0000").tolist())
+
+
+def test_a_frame_without_depth_is_no_reference(tmp_path: Path) -> None:
+    sequences = captures(2)
+    frame = sequences[0].frames[6]
+    empty = replace(frame, load=lambda: replace(frame.load(), depth=torch.zeros(48, 64)))
+    frames = (*sequences[0].frames[:6], empty, *sequences[0].frames[7:])
+    data = run(tmp_path / "cup", [replace(sequences[0], frames=frames), sequences[1]])
+    pairs = [p for s in ("train", "test") for p in data.pairs(s) if p.sequence == "cup/0000"]
+    assert 6 in {pair.query for pair in pairs}
+    assert 6 not in {pair.references[0] for pair in pairs}
+    assert 6 not in data.reference_frames("cup/0000")
+
+
+def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(np, "save", full)
+    with pytest.raises(InputError, match=r"no space left.*MiB needed") as caught:
+        run(tmp_path / "cup", captures(2))
+    assert str(tmp_path / "cup") in str(caught.value)
+    assert not [path for path in (tmp_path / "cup").rglob("*") if path.is_file()]
+    assert not list((tmp_path / "cup").rglob("*.tmp"))
+
+
+def test_the_square_follows_the_object_but_stays_inside() -> None:
+    camera = ring(even(1), elevation_deg=0)[0]
+    image = torch.rand(3, 48, 64)
+    mask = torch.zeros(48, 64)
+    mask[20:30, 34:42] = 1  # centred at u = 38: the square starts at 38 - 24
+    square = object_square(View(image, camera, mask=mask), 48)
+    torch.testing.assert_close(square.image, image[:, :, 14:62])
+    assert square.camera.intrinsics[0, 2] == 32 - 14
+    mask[:, 60:] = 1
+    assert object_square(View(image, camera, mask=mask), 48).camera.intrinsics[0, 2] == 32 - 16
+
+
+def test_the_split_file_names_the_test_sequences(tmp_path: Path) -> None:
+    run(tmp_path / "cup", captures(4), test_names={"0002"})
+    split = build.json.loads((tmp_path / "cup" / "split.json").read_text())
+    assert split["test"] == ["cup/0002"]
+    assert len(split["sha256"]) == 64

@@ -1,0 +1,84 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from orbits import capture, even, looking_at, ring
+
+from data_prep.filter import judge
+from extrap_train.config import PrepConfig
+
+OPTIONS = PrepConfig()
+
+
+@pytest.mark.parametrize(
+    "azimuths",
+    [even(24), even(40, 720), even(60, 1080) + 3, np.r_[even(22, 330)], even(24)[::-1].copy()],
+    ids=["circle", "two turns", "three turns", "open by 45°", "clockwise"],
+)
+def test_circles_are_kept(azimuths: np.ndarray) -> None:
+    verdict = judge(capture(ring(azimuths)), OPTIONS)
+    assert verdict.kept, verdict.reason
+    assert verdict.gap_deg <= 30
+    assert verdict.coverage_deg >= 300
+
+
+def test_gap_and_coverage_are_measured() -> None:
+    azimuths = np.r_[np.arange(0, 101, 10), np.arange(125, 316, 10)]
+    verdict = judge(capture(ring(azimuths, 35)), OPTIONS)
+    assert verdict.gap_deg == pytest.approx(25, abs=0.1)
+    assert verdict.coverage_deg == pytest.approx(315, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("azimuths", "reason"),
+    [
+        (even(24, 200), "covers 192° < 300°"),
+        (np.r_[even(10, 100), even(15, 200) + 135], "azimuth gap 38° > 30°"),
+        (even(5), "5 frames, fewer than 8"),
+    ],
+)
+def test_others_are_dropped_with_the_reason(azimuths: np.ndarray, reason: str) -> None:
+    verdict = judge(capture(ring(azimuths)), OPTIONS)
+    assert not verdict.kept
+    assert reason in verdict.reason
+    assert judge(capture(ring(azimuths)), replace(OPTIONS, full_circle_only=False)).kept
+
+
+def test_an_elliptical_high_orbit_is_kept() -> None:
+    radius = 2 + np.cos(np.radians(2 * even(30)))
+    assert judge(capture(ring(even(30), 50, radius)), OPTIONS).kept
+
+
+def test_a_line_and_a_point_and_a_panorama_are_no_circles() -> None:
+    line = np.stack([np.linspace(-1, 1, 12), np.full(12, -3.0), np.zeros(12)], 1)
+    assert "covers" in judge(capture(looking_at(line, np.zeros(3))), OPTIONS).reason
+    tripod = ring(even(24))
+    tripod.world_to_cam[:, :3, 3] = 0
+    assert "face a common centre" in judge(capture(tripod), OPTIONS).reason
+    outwards = ring(even(24), 0)
+    outwards.world_to_cam[:, [0, 2]] *= -1
+    assert "face a common centre" in judge(capture(outwards), OPTIONS).reason
+
+
+def test_overhead_views_do_not_fill_a_gap() -> None:
+    half, top = ring(even(12, 180)), ring(even(12), 85)
+    both = torch.cat([half.world_to_cam, top.world_to_cam])
+    camera = replace(half, world_to_cam=both, intrinsics=half.intrinsics[:1].expand(24, 3, 3))
+    assert not judge(capture(camera), OPTIONS).kept
+
+
+def test_stated_qualities_count_and_missing_ones_do_not() -> None:
+    camera = ring(even(24))
+    assert judge(capture(camera, viewpoint_quality=0.5, point_cloud_quality=1.0), OPTIONS).kept
+    poor = judge(capture(camera, viewpoint_quality=-0.5, point_cloud_quality=float("nan")), OPTIONS)
+    assert poor.reason == "viewpoint quality -0.50 < 0; point cloud quality nan < -2"
+
+
+def test_a_nan_camera_is_named() -> None:
+    camera = ring(even(24))
+    camera.world_to_cam[7, 0, 3] = float("nan")
+    verdict = judge(capture(camera), OPTIONS)
+    assert not verdict.kept
+    assert "degenerate camera" in verdict.reason
+    assert "frame7" in verdict.reason

@@ -1,0 +1,73 @@
+"""Cameras on orbits and captures made of them, in memory."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from extrap_train.data.sequences import Frame, Sequence
+from extrap_train.errors import InputError
+from extrap_train.views import Camera, View
+
+
+def looking_at(
+    positions: np.ndarray, target: np.ndarray, height: int = 48, width: int = 64
+) -> Camera:
+    """Cameras whose optical axes meet in `target`, image-up towards +z."""
+    forward = target - positions
+    forward = forward / np.linalg.norm(forward, axis=1, keepdims=True)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    rotation = np.stack([right, np.cross(forward, right), forward], 1)
+    world_to_cam = np.tile(np.eye(4), (len(positions), 1, 1))
+    world_to_cam[:, :3, :3] = rotation
+    world_to_cam[:, :3, 3] = -np.einsum("nij,nj->ni", rotation, positions)
+    intrinsics = np.tile(np.diag([60.0, 60.0, 1.0]), (len(positions), 1, 1))
+    intrinsics[:, :2, 2] = width / 2, height / 2
+    return Camera(
+        torch.tensor(world_to_cam).float(), torch.tensor(intrinsics).float(), height, width
+    )
+
+
+def ring(
+    azimuths_deg: np.ndarray,
+    elevation_deg: float = 20.0,
+    radius: float | np.ndarray = 3.0,
+    center: tuple[float, float, float] = (0.5, -0.2, 0.1),
+) -> Camera:
+    """Cameras around +z at azimuths of one's choice."""
+    azimuth, elevation = np.radians(azimuths_deg), np.radians(elevation_deg)
+    level = np.stack([np.cos(azimuth), np.sin(azimuth)], 1) * np.cos(elevation)
+    directions = np.concatenate([level, np.full((len(level), 1), np.sin(elevation))], 1)
+    radii = np.broadcast_to(radius, len(level))[:, None]
+    return looking_at(directions * radii + np.array(center), np.array(center))
+
+
+def even(count: int, span_deg: float = 360.0) -> np.ndarray:
+    """Azimuths in equal steps."""
+    return np.arange(count) * span_deg / count
+
+
+def capture(
+    camera: Camera,
+    name: str = "one",
+    depth: float = 3.0,
+    mask: Callable[[int], torch.Tensor | None] = lambda index: None,
+    broken: int | None = None,
+    **quality: float,
+) -> Sequence:
+    """A capture whose frame `i` is all of the grey `i / n`, at one depth."""
+    count = len(camera.world_to_cam)
+
+    def load(index: int) -> View:
+        if index == broken:
+            raise InputError(f"{name}/frame{index}.jpg: truncated; restore it")
+        size = (camera.height, camera.width)
+        grey, flat = torch.full((3, *size), index / count), torch.full(size, depth)
+        return View(grey, camera[index], flat, mask(index), f"frame{index}")
+
+    frames = tuple(
+        Frame(f"frame{i}", camera[i], True, mask(i) is not None, lambda i=i: load(i))
+        for i in range(count)
+    )
+    return Sequence("cup", name, frames, **quality)
