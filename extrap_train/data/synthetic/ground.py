@@ -15,7 +15,8 @@ from extrap_train.data.synthetic.material import (
 from extrap_train.data.synthetic.scene import Part, placement
 from extrap_train.data.synthetic.shapes import flat_ground, lathe, rounded_box
 
-WOODS = ["#8a5a33", "#a9743f", "#6b4423", "#c39a62", "#54382a"]
+WOODS = ["#a06a3d", "#b9834c", "#8a5c36", "#d0aa74", "#6e4a34"]
+FLOOR_WOODS = ["#b98a58", "#cfa56e", "#a67c55", "#d8bd92", "#94724f", "#b5a48c"]
 CLOTHS = ["#8c2f39", "#2f4b7c", "#3d6b4f", "#d9cfb8", "#7a6a8f", "#b98b4e", "#5b5b66"]
 STONES = ["#9c9891", "#b3a896", "#7f8184", "#a58f7b"]
 
@@ -58,7 +59,7 @@ def bricks(rng: np.random.Generator) -> Texture:
 
 def floorboards(rng: np.random.Generator) -> Texture:
     """Planks with grain along X."""
-    tone = varied(rng, WOODS)
+    tone = varied(rng, FLOOR_WOODS)
     grain = Mottled(tone * 0.6, tone * 1.3, 7.0, draw_seed(rng), 3, 0.8, stretch=(0.12, 1.0, 1.0))
     size = (rng.uniform(1.5, 2.5), rng.uniform(0.2, 0.4))
     return Tiles(grain, tone * 0.25, size, draw_seed(rng), 0.02, 0.37, 0.3)
@@ -83,7 +84,7 @@ def carpet(rng: np.random.Generator) -> Texture:
 
 def table_wood(rng: np.random.Generator) -> Texture:
     """A polished board of one or several planks."""
-    tone = varied(rng, WOODS)
+    tone = varied(rng, FLOOR_WOODS + WOODS[:2])
     return Tiles(
         Mottled(tone * 0.6, tone * 1.25, 6.0, draw_seed(rng), 3, 0.9, stretch=(0.13, 1.0, 1.0)),
         tone * 0.35,

@@ -34,7 +34,8 @@ def draw_light(rng: np.random.Generator, indoors: bool) -> Light:
     sun = np.array([1 + warmth, 1.0, 1 - 1.6 * warmth]) * share * _EXPOSURE
     coolness = rng.uniform(-0.03, 0.04) if indoors else rng.uniform(0.0, 0.1)
     sky = np.array([1 - coolness, 1.0, 1 + coolness]) * (1.05 - share) * _EXPOSURE
-    return Light(to_sun, sun, sky, sky * rng.uniform(0.3, 0.5))
+    ground = sky * rng.uniform(0.3, 0.5)
+    return Light(*(x.astype(np.float32) for x in (to_sun, sun, sky, ground)))
 
 
 def ambient_light(mesh: Mesh, light: Light, casters: EmbreeScene) -> Float[np.ndarray, "v 3"]:

@@ -77,7 +77,8 @@ def varied(rng: np.random.Generator, codes: list[str], spread: float = 0.12) -> 
 def mix(a: np.ndarray, b: np.ndarray, share: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
     """From `a` (share 0) to `b` (share 1); each a colour or one colour per point."""
     t = np.clip(share, 0, 1).astype(np.float32)[:, None]
-    return a + (b - a) * t
+    low, high = np.asarray(a, np.float32), np.asarray(b, np.float32)
+    return low + (high - low) * t
 
 
 def step(x: Float[np.ndarray, " n"], footprint: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

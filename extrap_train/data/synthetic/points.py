@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from extrap_train.data.synthetic.material import linear_to_srgb
-from extrap_train.data.synthetic.render import radiance
 from extrap_train.data.synthetic.scene import SyntheticScene
+from extrap_train.data.synthetic.shading import radiance
 
 _REACH = 1.5  # of the cloud, in object heights from the origin
 _PIXEL_ANGLE = 0.004  # radians: textures are sampled as finely as a photograph shows them

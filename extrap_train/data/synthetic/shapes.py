@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from extrap_train.data.synthetic.vectors import rotated
+
 _CREASE = np.cos(np.deg2rad(35.0))
 
 
@@ -177,13 +179,6 @@ def moved(mesh: Mesh, matrix: Float[np.ndarray, "4 4"]) -> Mesh:
         mesh.faces,
         rotated(mesh.normals, matrix[:3, :3] / scale),
     )
-
-
-def rotated(
-    vectors: Float[np.ndarray, "n 3"], matrix: Float[np.ndarray, "3 3"]
-) -> Float[np.ndarray, "n 3"]:
-    """`matrix` applied to each vector; unlike BLAS, the same bits for any number of threads."""
-    return np.einsum("nj,ij->ni", vectors, matrix)
 
 
 def displaced(mesh: Mesh, offset: Float[np.ndarray, "v 3"]) -> Mesh:

@@ -158,7 +158,7 @@ class _Binding:
 def _binding(rng: np.random.Generator, scale: float) -> _Binding:
     height = scale
     width = height * rng.uniform(0.64, 0.85)
-    thickness = rng.uniform(0.1, 0.26) * scale
+    thickness = rng.uniform(0.14, 0.28) * scale
     ground, ink, second = (varied(rng, [_CLOTHS[i]], 0.08) for i in rng.permutation(9)[:3])
     gloss = rng.uniform(0.0, 0.35)
     cover = Cover(
