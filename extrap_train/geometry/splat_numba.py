@@ -97,7 +97,7 @@ def _add(u, v, depth, values, span, rows, nearest, summed):  # noqa: ANN001, ANN
                         summed[y + dy, x + dx, start + lane] += weight * values[i, start + lane]
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(cache=True, error_model="numpy")
 def _split(position):  # noqa: ANN001, ANN202
     """Whole and fractional part of a coordinate, counted from pixel centres."""
     shifted = position - _HALF

@@ -9,29 +9,22 @@ from torch import Tensor
 from extrap_train.geometry.cameras import pixel_grid
 from extrap_train.geometry.normals import Surface, plane_vectors, surface_from_depth
 from extrap_train.geometry.splat_kernel import ScreenPoints
+from extrap_train.geometry.splat_pieces import (
+    LARGEST_SPACING,
+    MOST_POINTS,
+    REACH_MARGIN,
+    Pieces,
+    Samples,
+)
 from extrap_train.geometry.splat_projection import (
     LEAST_DEPTH_RATIO,
     project_pixels,
     reference_to_query_pixels,
     subdivide,
 )
+from extrap_train.geometry.splat_samples_numba import sample_pieces_numba
 from extrap_train.geometry.splat_unseen import hidden_by_unseen
 from extrap_train.views import Camera
-
-LARGEST_SPACING = 1.05
-"""Query pixels between neighbouring points of a surface: every pixel centre then lies well inside a footprint."""
-REACH_MARGIN = 0.03
-"""Query pixels by which neighbouring pieces of surface overlap, so that no seam shows what is behind."""
-MOST_POINTS = 8
-"""Points per reference pixel along each axis: a surface stretched further is torn, it was hardly seen."""
-
-
-@dataclass(frozen=True)
-class Samples:
-    """Points of the references' surfaces that face the query camera, with interpolated values."""
-
-    points: ScreenPoints
-    values: Float[Tensor, "n c"]
 
 
 def sample_surfaces(
@@ -41,15 +34,24 @@ def sample_surfaces(
     query: Camera,
 ) -> Samples:
     """Sample every reference pixel as finely as the query sees it, with its surface's slope and values."""
-    b, k, c, h, w = maps.shape
     surface = surface_from_depth(depths, cameras)
     query_to_reference = cameras.world_to_cam @ query.cam_to_world[:, None]
     # n·x = 1 on the tangent plane; the query's centre must lie on the reference's side of it.
-    towards = plane_vectors(surface, cameras) * query_to_reference[..., None, None, :3, 3]
-    drawn = surface.valid & (towards.sum(-1) < 1)
-    matrix = reference_to_query_pixels(cameras, query)
+    away = plane_vectors(surface, cameras)
+    x, y, z = (away * query_to_reference[..., None, None, :3, 3]).unbind(-1)
+    drawn = surface.valid & (x + y + z < 1)
+    pieces = Pieces(surface, drawn, reference_to_query_pixels(cameras, query), cameras, query)
+    differentiated = torch.is_grad_enabled() and (depths.requires_grad or maps.requires_grad)
+    if depths.is_cuda or depths.dtype != torch.float32 or differentiated:
+        return _sample(pieces, maps)
+    return sample_pieces_numba(pieces, maps)
+
+
+def _sample(pieces: Pieces, maps: Float[Tensor, "b k c h w"]) -> Samples:
+    surface, matrix, query = pieces.surface, pieces.matrix, pieces.query
+    k, c, h, w = maps.shape[1:]
     steps = _steps(surface, matrix)
-    counts = torch.where(drawn[..., None], _points_per_axis(steps), 0).reshape(-1, 2)
+    counts = torch.where(pieces.drawn[..., None], _points_per_axis(steps), 0).reshape(-1, 2)
     pixel, offset = subdivide(counts)
     corner = _Corner.around(surface, pixel, offset)
     inverse = surface.inverse_depth.reshape(-1)[pixel] + corner.steps(offset)
@@ -61,17 +63,12 @@ def sample_surfaces(
     )
     inside = (u > -0.5) & (u < query.width + 0.5) & (v > -0.5) & (v < query.height + 0.5)
     seen = (inside & (inverse > 0) & (ratio > LEAST_DEPTH_RATIO)).nonzero()[:, 0]
-    cells = steps.reshape(-1, 2, 2)[pixel[seen]] / counts[pixel[seen], :, None]
-    reach = (cells.abs().sum(1) / 2 + REACH_MARGIN).clamp(max=1)
-    points = ScreenPoints(
-        u[seen],
-        v[seen],
-        (ratio / inverse)[seen],
-        reach[:, 0],
-        reach[:, 1],
-        (pixel // (h * w))[seen],
-    )
-    kept = (~hidden_by_unseen(surface, matrix, cameras, query, points)).nonzero()[:, 0]
+    cells = (steps.reshape(-1, 2, 2)[pixel[seen]] / counts[pixel[seen], :, None]).abs()
+    reach = ((cells[:, 0] + cells[:, 1]) / 2 + REACH_MARGIN).clamp(max=1)
+    reference = (pixel // (h * w))[seen]
+    depth = (ratio / inverse)[seen]
+    points = ScreenPoints(u[seen], v[seen], depth, reach[:, 0], reach[:, 1], reference)
+    kept = (~hidden_by_unseen(surface, matrix, pieces.cameras, query, points)).nonzero()[:, 0]
     points = points[kept]
     values = corner.interpolate(maps.movedim(2, -1).reshape(-1, c), pixel, offset, seen[kept])
     return Samples(replace(points, image=points.image // k), values)
@@ -93,7 +90,8 @@ def _steps(surface: Surface, matrix: Float[Tensor, "b k 3 4"]) -> Float[Tensor, 
 
 def _points_per_axis(steps: Float[Tensor, "b k h w 2 2"]) -> Int[Tensor, "b k h w 2"]:
     """Points along u and v that keep their spacing in the query below `LARGEST_SPACING`."""
-    length = torch.linalg.vector_norm(steps.detach(), dim=-1)
+    across, down = steps.detach().square().unbind(-1)
+    length = (across + down).sqrt()
     return (length / LARGEST_SPACING).clamp(max=MOST_POINTS).ceil().clamp(min=1).long()
 
 
@@ -122,7 +120,8 @@ class _Corner:
 
     def steps(self, offset: Float[Tensor, "m 2"]) -> Float[Tensor, "m"]:
         """Change of inverse depth from the pixel's centre."""
-        return (self.slope * offset).sum(-1)
+        across, down = (self.slope * offset).unbind(-1)
+        return across + down
 
     def interpolate(
         self,

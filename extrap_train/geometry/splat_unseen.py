@@ -117,4 +117,4 @@ def _length(
     """Query pixels between the front and the back of each wall."""
     x0, y0, _ = project_pixels(matrix, u, v, start)
     x1, y1, _ = project_pixels(matrix, u, v, stop)
-    return torch.hypot(x1 - x0, y1 - y0)
+    return ((x1 - x0).square() + (y1 - y0).square()).sqrt()
