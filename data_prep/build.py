@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from tqdm import tqdm
 
-from data_prep.filter import Verdict, judge
+from data_prep.filter import Verdict, judge_all
 from data_prep.frames import frames_key, make_frames
 from data_prep.select import select_pairs
 from data_prep.split import Split, held_out, split_sequences
@@ -121,13 +121,13 @@ def _make_all(
 ) -> list[Outcome]:
     """Threads, not processes: decoding and depth release the interpreter lock."""
 
-    def make(sequence: Sequence) -> Outcome:
-        return _make(sequence, depth_source, options, folder)
+    def make(sequence: Sequence, verdict: Verdict) -> Outcome:
+        return _make(sequence, verdict, depth_source, options, folder)
 
     folder.mkdir(parents=True, exist_ok=True)
     with ThreadPoolExecutor(workers) as pool:
         done = tqdm(
-            pool.map(make, sequences),
+            pool.map(make, sequences, judge_all(sequences, options)),
             "preparing",
             len(sequences),
             unit="sequence",
@@ -141,9 +141,12 @@ def _make_all(
 
 
 def _make(
-    sequence: Sequence, depth_source: DepthSource, options: PrepConfig, folder: Path
+    sequence: Sequence,
+    verdict: Verdict,
+    depth_source: DepthSource,
+    options: PrepConfig,
+    folder: Path,
 ) -> Outcome:
-    verdict = judge(sequence, options)
     if not verdict.kept:
         return Outcome(sequence, verdict, None)
     target = frames_folder(folder, f"{sequence.category}/{sequence.name}")
@@ -266,7 +269,7 @@ def _nothing_left(outcomes: list[Outcome]) -> str:
     listed = "; ".join(f"{count} times {reason}" for reason, count in reasons)
     return (
         f"none of the {len(outcomes)} sequences of {outcomes[0].sequence.category} can be used: "
-        f"{listed}. Loosen prep.* (prep.full_circle_only=false) or add sequences"
+        f"{listed}. Loosen prep.* (prep.full_circle=ignore keeps partial turns) or add sequences"
     )
 
 

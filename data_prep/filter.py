@@ -1,7 +1,9 @@
 """Which captures are good enough to learn from (METHOD §6, paper III-A.1)."""
 
+import logging
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -12,6 +14,8 @@ from extrap_train.data.sequences import Sequence
 from extrap_train.data.validation import is_degenerate
 from extrap_train.geometry.viewpoints import facing, fit_orbit, scene_center
 from extrap_train.views import Camera
+
+LOG = logging.getLogger(__name__)
 
 MIN_FRAMES = 8
 """Fewer do not make a capture; two do, where a full circle is not asked for."""
@@ -35,10 +39,27 @@ class Verdict:
     """360° less the arc's opening, which is the largest gap of all."""
 
 
+def judge_all(sequences: ListOf[Sequence], options: PrepConfig) -> list[Verdict]:
+    """Keep or drop each sequence of a category.
+
+    Where a full circle is preferred and none is there, every sequence that is sound otherwise is
+    kept: a few photographs of one object still train something, and the log says what they lack.
+    """
+    verdicts = [judge(sequence, options) for sequence in sequences]
+    if options.full_circle != "prefer" or any(verdict.kept for verdict in verdicts):
+        return verdicts
+    relaxed = [judge(sequence, replace(options, full_circle="ignore")) for sequence in sequences]
+    if any(verdict.kept for verdict in relaxed):
+        lacking = "; ".join(sorted({verdict.reason for verdict in verdicts})[:3])
+        LOG.warning("no sequence is a full circle (%s): all that are sound are kept", lacking)
+    return relaxed
+
+
 def judge(sequence: Sequence, options: PrepConfig) -> Verdict:
     """Keep or drop a sequence; a quality that the capture does not state is no reason."""
     count = len(sequence.frames)
-    least = MIN_FRAMES if options.full_circle_only else 2
+    circle = options.full_circle != "ignore"
+    least = MIN_FRAMES if circle else 2
     if count < least:
         return Verdict(False, f"{count} frames, fewer than {least}", count)
     cameras = poses(sequence)
@@ -51,7 +72,7 @@ def judge(sequence: Sequence, options: PrepConfig) -> Verdict:
     facing_share = float(facing(cameras, scene_center(cameras), _FACING_RAD).mean())
     gap, coverage = azimuth_coverage(cameras)
     reasons = _quality_reasons(sequence, options)
-    if options.full_circle_only:
+    if circle:
         reasons += _circle_reasons(facing_share, gap, coverage, options)
     return Verdict(not reasons, "; ".join(reasons), count, gap, coverage)
 

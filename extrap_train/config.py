@@ -101,7 +101,8 @@ class PrepConfig:
     max_pair_angle_deg: float = 88.0
     near_duplicate_deg: float = 6.0
     """A pair is skipped if a chosen one has both its frames within this angle of its own."""
-    full_circle_only: bool = True
+    full_circle: str = "prefer"
+    """`require` drops what is no full circle, `prefer` does unless nothing is one, `ignore` keeps it."""
 
 
 @dataclass
@@ -243,6 +244,7 @@ def validate(config: TrainConfig | DataPrepConfig, tasks: tuple[str, ...]) -> No
 
 def _check_prep(prep: PrepConfig) -> None:
     _check_positive("prep", prep, ("image_size", "max_uses"))
+    _check_one_of("prep.full_circle", prep.full_circle, ("require", "prefer", "ignore"))
     if not 0 <= prep.min_pair_angle_deg < prep.max_pair_angle_deg <= 90:
         raise InputError(
             f"prep.min_pair_angle_deg={prep.min_pair_angle_deg} and "

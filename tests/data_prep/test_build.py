@@ -121,8 +121,9 @@ def test_a_failing_sequence_is_reported_and_the_rest_goes_on(tmp_path: Path) -> 
 
 def test_nothing_left_sums_up_the_reasons(tmp_path: Path) -> None:
     arcs = [capture(ring(even(24, 90)), str(i)) for i in range(3)]
+    options = replace(OPTIONS, full_circle="require")
     with pytest.raises(InputError, match=r"none of the 3 sequences of cup.*3 times covers 86°"):
-        run(tmp_path / "cup", arcs)
+        run(tmp_path / "cup", arcs, options=options)
     with pytest.raises(InputError, match="no sequence to prepare"):
         run(tmp_path / "cup", [])
 

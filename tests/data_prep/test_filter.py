@@ -5,7 +5,7 @@ import pytest
 import torch
 from orbits import capture, even, looking_at, ring
 
-from data_prep.filter import judge
+from data_prep.filter import judge, judge_all
 from extrap_train.config import PrepConfig
 
 OPTIONS = PrepConfig()
@@ -42,7 +42,7 @@ def test_others_are_dropped_with_the_reason(azimuths: np.ndarray, reason: str) -
     verdict = judge(capture(ring(azimuths)), OPTIONS)
     assert not verdict.kept
     assert reason in verdict.reason
-    assert judge(capture(ring(azimuths)), replace(OPTIONS, full_circle_only=False)).kept
+    assert judge(capture(ring(azimuths)), replace(OPTIONS, full_circle="ignore")).kept
 
 
 def test_an_elliptical_high_orbit_is_kept() -> None:
@@ -82,3 +82,16 @@ def test_a_nan_camera_is_named() -> None:
     assert not verdict.kept
     assert "degenerate camera" in verdict.reason
     assert "frame7" in verdict.reason
+
+
+def test_partial_turns_are_kept_only_where_there_is_no_full_one(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    circle, arc = capture(ring(even(24))), capture(ring(even(24, 200)))
+    poor = capture(ring(even(24, 200)), viewpoint_quality=-1.0)
+    assert [v.kept for v in judge_all([circle, arc, poor], OPTIONS)] == [True, False, False]
+    assert not caplog.text
+    assert [v.kept for v in judge_all([arc, poor], OPTIONS)] == [True, False]
+    assert "no sequence is a full circle (covers 192°" in caplog.text
+    required = replace(OPTIONS, full_circle="require")
+    assert not any(v.kept for v in judge_all([arc, poor], required))
