@@ -16,6 +16,8 @@ SCENE = Scene((sphere(0.8), plane(0.9, (0.0, 1.0, 0.0))))
 def view_at(azimuth_deg: float, size: int = 32) -> View:
     camera = orbit_camera(azimuth_deg, size=size).cropped(0, 0, size, size + 8)
     depth = SCENE.depth(camera)
+    # The horizon is further away than a file of millimetres can say.
+    depth[depth > 50] = 0
     mask = (Scene((sphere(0.8),)).depth(camera) > 0).float()
     return View(SCENE.image(camera), camera, depth, mask)
 

@@ -1,0 +1,203 @@
+import json
+import logging
+
+import numpy as np
+import pytest
+import torch
+from captures import SCENE, view_at
+from PIL import Image
+
+from extrap_train.data.posed import read_transforms
+from extrap_train.errors import InputError
+from extrap_train.geometry.opengl import opengl_from_world_to_cam
+
+
+def write_transforms(folder, views, **common):
+    """A nerfstudio folder; depth files in millimetres."""
+    (folder / "images").mkdir(parents=True)
+    frames = []
+    for index, view in enumerate(views):
+        stem = f"{index:03d}"
+        Image.fromarray(to_bytes(view.image.permute(1, 2, 0))).save(folder / f"images/{stem}.png")
+        Image.fromarray(to_bytes(view.mask)).save(folder / f"mask_{stem}.png")
+        depth = (view.depth.numpy() * 1000).round().astype(np.uint16)
+        Image.fromarray(depth).save(folder / f"depth_{stem}.png")
+        k = view.camera.intrinsics
+        frames.append(
+            {
+                "file_path": f"./images/{stem}.png",
+                "transform_matrix": opengl_from_world_to_cam(view.camera.world_to_cam).tolist(),
+                "fl_x": k[0, 0].item(),
+                "fl_y": k[1, 1].item(),
+                "cx": k[0, 2].item(),
+                "cy": k[1, 2].item(),
+                "depth_file_path": f"depth_{stem}.png",
+                "mask_path": f"mask_{stem}.png",
+            }
+        )
+    height, width = views[0].camera.height, views[0].camera.width
+    write_json(folder, {"camera_model": "OPENCV", "h": height, "w": width, "frames": frames})
+    if common:
+        write_json(folder, read_json(folder) | common)
+
+
+def to_bytes(values):
+    return (values.numpy() * 255).round().astype(np.uint8)
+
+
+def read_json(folder):
+    return json.loads((folder / "transforms.json").read_text())
+
+
+def write_json(folder, content):
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write_transforms(tmp_path / "capture", [view_at(azimuth) for azimuth in (0, 30, 60)])
+    return tmp_path / "capture"
+
+
+def complaint(folder) -> str:
+    with pytest.raises(InputError) as caught:
+        read_transforms(folder).frames[0].load()
+    message = str(caught.value)
+    assert "\n" not in message
+    assert ";" in message
+    return message
+
+
+def test_what_was_photographed_is_read(folder):
+    sequence = read_transforms(folder)
+    assert sequence.name == "capture"
+    assert [frame.name for frame in sequence.frames] == ["000.png", "001.png", "002.png"]
+    for azimuth, frame in zip((0, 30, 60), sequence.frames, strict=True):
+        truth, read = view_at(azimuth), frame.load()
+        torch.testing.assert_close(read.camera.world_to_cam, truth.camera.world_to_cam)
+        torch.testing.assert_close(read.camera.intrinsics, truth.camera.intrinsics)
+        torch.testing.assert_close(read.image, truth.image, rtol=0, atol=0.5 / 255 + 1e-6)
+        torch.testing.assert_close(read.depth, truth.depth, rtol=0, atol=6e-4)
+        torch.testing.assert_close(read.mask, truth.mask)
+
+
+def test_intrinsics_may_be_common_to_all_or_an_angle(folder):
+    content = read_json(folder)
+    for frame in content["frames"]:
+        for key in ("fl_x", "fl_y", "cx", "cy"):
+            del frame[key]
+    content["camera_angle_x"] = 2 * np.arctan(0.5)
+    del content["h"], content["w"]
+    write_json(folder, content)
+    k = read_transforms(folder).frames[0].camera.intrinsics
+    torch.testing.assert_close(k, torch.tensor([[40.0, 0, 20], [0, 40, 16], [0, 0, 1]]))
+
+
+def test_entries_without_a_picture_are_reported(folder, caplog):
+    (folder / "images" / "001.png").unlink()
+    with caplog.at_level(logging.WARNING):
+        sequence = read_transforms(folder)
+    assert len(sequence.frames) == 2
+    (record,) = caplog.records
+    assert "1 of 3 entries have no picture and are left out: images/001.png" in record.getMessage()
+
+
+def test_no_picture_at_all(folder):
+    for picture in (folder / "images").iterdir():
+        picture.unlink()
+    assert "none of the 3 pictures" in complaint(folder)
+
+
+def test_lens_distortion_is_undone(folder):
+    content = read_json(folder) | {"k1": 0.3, "k2": -0.05, "p1": 0.002, "p2": 0.001}
+    write_json(folder, content)
+    view = read_transforms(folder).frames[0].load()
+    # Where the distorted picture shows a pixel of the straight one, by the textbook formula.
+    k, original = view.camera.intrinsics, view_at(0)
+    x = (30.5 - k[0, 2]) / k[0, 0]
+    y = (24.5 - k[1, 2]) / k[1, 1]
+    r2 = x * x + y * y
+    radial = 1 + 0.3 * r2 - 0.05 * r2 * r2
+    x_seen = x * radial + 2 * 0.002 * x * y + 0.001 * (r2 + 2 * x * x)
+    y_seen = y * radial + 0.002 * (r2 + 2 * y * y) + 2 * 0.001 * x * y
+    k_lens = original.camera.intrinsics
+    u, v = k_lens[0, 0] * x_seen + k_lens[0, 2], k_lens[1, 1] * y_seen + k_lens[1, 2]
+    grid = torch.stack([u / 40 * 2 - 1, v / 32 * 2 - 1]).reshape(1, 1, 1, 2)
+    expected = torch.nn.functional.grid_sample(original.image[None], grid, align_corners=False)
+    torch.testing.assert_close(view.image[:, 24, 30], expected[0, :, 0, 0], rtol=0, atol=0.01)
+    assert view.depth.shape == view.mask.shape == (32, 40)
+    assert SCENE.depth(original.camera).unique().numel() >= view.depth.unique().numel()
+
+
+def test_the_scale_of_the_world_is_the_scale_of_its_depth(folder):
+    write_json(folder, read_json(folder) | {"applied_scale": 0.5})
+    depth = read_transforms(folder).frames[0].load().depth
+    torch.testing.assert_close(depth, view_at(0).depth / 2, rtol=0, atol=6e-4)
+
+
+def test_depth_may_be_an_array(folder):
+    content = read_json(folder)
+    content["frames"][0]["depth_file_path"] = "depth.npy"
+    write_json(folder, content | {"depth_unit_scale_factor": 1.0})
+    np.save(folder / "depth.npy", view_at(0).depth.numpy())
+    torch.testing.assert_close(read_transforms(folder).frames[0].load().depth, view_at(0).depth)
+    np.save(folder / "depth.npy", np.array([{}], dtype=object))
+    assert "depth.npy: is no array of numbers" in complaint(folder)
+    np.save(folder / "depth.npy", np.ones((3, 3)))
+    assert "depth.npy: is an array of float64 (3, 3)" in complaint(folder)
+
+
+def test_pictures_of_the_same_name_in_two_folders(folder):
+    (folder / "left").mkdir()
+    (folder / "images" / "001.png").rename(folder / "left" / "000.png")
+    content = read_json(folder)
+    content["frames"][1]["file_path"] = "left/000.png"
+    write_json(folder, content)
+    names = [frame.name for frame in read_transforms(folder).frames]
+    assert names == ["images_000.png", "images_002.png", "left_000.png"]
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"file_path": "../x.png"}, "climbs out of its folder"),
+        ({"file_path": "/x.png"}, "climbs out of its folder"),
+        ({"file_path": 3}, "text `file_path` as frame 0"),
+        ({"mask_path": "../x.png"}, "climbs out of its folder"),
+        ({"transform_matrix": [[1, 2], [3, 4]]}, "has shape (2, 2)"),
+        ({"transform_matrix": "none"}, "is malformed"),
+        ({"transform_matrix": np.zeros((4, 4)).tolist()}, "is degenerate"),
+        ({"transform_matrix": np.full((4, 4), float("nan")).tolist()}, "is degenerate"),
+        ({"fl_x": 0}, "is degenerate"),
+        ({"fl_x": float("nan")}, "the lens of images/000.png is not finite"),
+        ({"fl_x": "wide"}, "is malformed"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera model 'EQUIRECTANGULAR' is none of"),
+        ({"k1": 1e6}, "cannot be undone"),
+        ({"w": 41}, "is 32 x 40 pixels"),
+        ({"w": -1}, "image size 32 x -1"),
+        ({"depth_file_path": "gone.png"}, "gone.png: no such file"),
+        ({"file_path": "images/001.png"}, "lists a picture twice"),
+    ],
+)
+def test_bad_entries(folder, change, expected):
+    content = read_json(folder)
+    content["frames"][0] |= change
+    write_json(folder, content)
+    assert expected in complaint(folder)
+
+
+def test_missing_intrinsics_and_pose(folder):
+    content = read_json(folder)
+    del content["frames"][0]["fl_x"]
+    write_json(folder, content)
+    assert "images/000.png has 'camera_angle_x'; add it" in complaint(folder)
+    del content["frames"][0]["transform_matrix"]
+    content["camera_angle_x"] = 1.0
+    write_json(folder, content)
+    assert "images/000.png has 'transform_matrix'; add it" in complaint(folder)
+
+
+@pytest.mark.parametrize("content", [[], {}, {"frames": []}, {"frames": {}}, {"frames": [1]}])
+def test_files_of_the_wrong_shape(folder, content):
+    write_json(folder, content)
+    assert "transforms.json: expected " in complaint(folder)
