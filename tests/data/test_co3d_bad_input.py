@@ -223,6 +223,11 @@ def test_mask_that_is_black_everywhere(root):
     assert "mask is black everywhere" in complaint(load_first, root)
 
 
+def test_an_image_that_is_listed_twice(root):
+    replace_frame_entries(root, frame_entries(root) * 2)
+    assert "sequence one lists an image twice" in complaint(read_category, root, "cup")
+
+
 def test_unknown_sequence_suggests_near_names(root):
     assert "'onne'; did you mean one?" in complaint(read_sequence, root, "cup", "onne")
 

@@ -1,0 +1,61 @@
+import errno
+from pathlib import Path
+
+import pytest
+
+from extrap_train.data.files import check_relative, resolve_inside, write_whole
+from extrap_train.errors import InputError
+
+
+@pytest.mark.parametrize("path", ["a.jpg", "a/b.jpg", "a..b/..c", "...", "a b/ü.png"])
+def test_paths_below_the_root_are_taken(path):
+    assert check_relative(path, Path("list.json")) == path
+
+
+@pytest.mark.parametrize("path", ["", "/a", "..", "a/..", "a/../b", "\\\\host\\a", "c:a", "a\0"])
+def test_other_paths_are_refused(path):
+    with pytest.raises(InputError, match=r"list\.json: the path .* only paths below"):
+        check_relative(path, Path("list.json"))
+
+
+def test_links_may_stay_inside_but_not_lead_out(tmp_path):
+    root = tmp_path / "root"
+    root.mkdir()
+    (root / "real.txt").write_text("real")
+    (root / "inside").symlink_to(root / "real.txt")
+    assert resolve_inside(root, "inside").read_text() == "real"
+    (tmp_path / "secret.txt").write_text("secret")
+    (root / "outside").symlink_to(tmp_path / "secret.txt")
+    with pytest.raises(InputError, match="leads out of"):
+        resolve_inside(root, "outside")
+
+
+def test_a_root_behind_a_link_is_the_users_choice(tmp_path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "disk" / "a.txt").write_text("a")
+    (tmp_path / "root").symlink_to(tmp_path / "disk")
+    assert resolve_inside(tmp_path / "root", "a.txt").read_text() == "a"
+
+
+def test_writing_makes_folders_and_replaces(tmp_path):
+    file = tmp_path / "deep" / "down" / "file.txt"
+    write_whole(file, b"first")
+    write_whole(file, b"second")
+    assert file.read_bytes() == b"second"
+    assert list(file.parent.iterdir()) == [file]
+
+
+def test_a_full_disk_leaves_the_old_file_and_says_so(tmp_path, monkeypatch):
+    file = tmp_path / "file.txt"
+    write_whole(file, b"old")
+
+    def write_half(path, content):
+        with path.open("wb") as stream:
+            stream.write(content[: len(content) // 2])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", write_half)
+    with pytest.raises(InputError, match=r"cannot be written \(No space left on device\); free"):
+        write_whole(file, b"newer")
+    assert file.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [file]
