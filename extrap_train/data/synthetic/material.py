@@ -9,6 +9,8 @@ from jaxtyping import Float
 from extrap_train.data.synthetic.noise import fractal_noise
 
 Color = Float[np.ndarray, " 3"]
+Numbers = Float[np.ndarray, " n"]
+"""One a point."""
 
 
 @dataclass(frozen=True)

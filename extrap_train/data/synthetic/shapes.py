@@ -1,6 +1,7 @@
-"""Triangle meshes with smooth normals from a handful of primitives. Units: object heights; +Z is up."""
+"""Triangle meshes with smooth normals from a handful of primitives; +Z is up."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -19,6 +20,11 @@ class Mesh:
     normals: Float[np.ndarray, "v 3"]
 
 
+def xyz(x: float, y: float, z: float) -> Float[np.ndarray, " 3"]:
+    """A point or an offset."""
+    return np.array([x, y, z], float)
+
+
 def lathe(profile: Float[np.ndarray, "k 2"], segments: int = 32) -> Mesh:
     """The surface of revolution of (radius, height) points around +Z; sharp corners stay sharp."""
     rings = _split_corners(np.asarray(profile, float))
@@ -33,7 +39,7 @@ def lathe(profile: Float[np.ndarray, "k 2"], segments: int = 32) -> Mesh:
         -1,
     )
     starts = np.cumsum([0, *[len(ring) for ring in rings]])
-    rows = np.concatenate([np.arange(a, b - 1) for a, b in zip(starts, starts[1:], strict=False)])
+    rows = np.concatenate([np.arange(a, b - 1) for a, b in pairwise(starts)])
     return _grid_mesh(vertices, rows, closed=True)
 
 
@@ -43,7 +49,7 @@ def _split_corners(profile: Float[np.ndarray, "k 2"]) -> list[np.ndarray]:
     steps /= np.linalg.norm(steps, axis=1, keepdims=True)
     corners = np.flatnonzero((steps[1:] * steps[:-1]).sum(1) < _CREASE) + 1
     bounds = [0, *corners.tolist(), len(profile) - 1]
-    return [profile[a : b + 1] for a, b in zip(bounds, bounds[1:], strict=False)]
+    return [profile[a : b + 1] for a, b in pairwise(bounds)]
 
 
 def sweep(
@@ -52,7 +58,7 @@ def sweep(
     segments: int = 10,
     flatten: float = 1.0,
 ) -> Mesh:
-    """A tube along a path, closed by small domes; `flatten` scales it along its sideways direction."""
+    """A tube along a path, closed by small domes; `flatten` scales its sideways direction."""
     path = np.asarray(path, float)
     radii = np.broadcast_to(np.asarray(radii, float), len(path))
     tangents = np.gradient(path, axis=0)

@@ -1,12 +1,24 @@
 """Chairs: four legs or a pedestal, plain, slatted or upholstered backs, with or without armrests."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from extrap_train.data.synthetic.ground import CLOTHS, WOODS, draw_seed
 from extrap_train.data.synthetic.material import Material, Mottled, Plaid, Plain, Wood, varied
 from extrap_train.data.synthetic.scene import Part, placement
-from extrap_train.data.synthetic.shapes import capsule, lathe, rounded_box, sheet, sweep
+from extrap_train.data.synthetic.shapes import (
+    Mesh,
+    capsule,
+    lathe,
+    rounded_box,
+    sheet,
+    sweep,
+    xyz,
+)
 
+Back = Callable[[float, float], np.ndarray]
+"""A point of the back: -1 left … 1 right, 0 seat … 1 top."""
 _PAINTS = ["#c9c4b8", "#7a2f2f", "#2f5a5f", "#d9b04a", "#3a3f4a", "#4f7a4f", "#b8623a"]
 
 
@@ -93,8 +105,10 @@ def _pedestal(rng: np.random.Generator, seat: float, width: float) -> list[Part]
     parts = [Part(column, metal)]
     for turn in 2 * np.pi * np.arange(5) / 5:
         tip = np.array([np.cos(turn), np.sin(turn), 0.0]) * width * 0.55
-        parts.append(Part(capsule(np.array([0, 0, 0.1]), tip + [0, 0, 0.07], 0.025, 0.018), metal))
-        parts.append(Part(capsule(tip + [0, 0, 0.03], tip + [0, 0, 0.031], 0.03), metal))
+        parts.append(
+            Part(capsule(np.array([0, 0, 0.1]), tip + xyz(0, 0, 0.07), 0.025, 0.018), metal)
+        )
+        parts.append(Part(capsule(tip + xyz(0, 0, 0.03), tip + xyz(0, 0, 0.031), 0.03), metal))
     return parts
 
 
@@ -124,7 +138,7 @@ def _back(
             return posts + [_rail(at, t, rng.uniform(0.03, 0.05), frame) for t in rails]
         case 2:
             low = rng.uniform(0.1, 0.35)
-            panel = _panel(at, low, 1.02, 0.0)
+            panel = _panel(at, low, 1.02)
             return [*posts, Part(panel, frame), _rail(at, 1.0, 0.03, frame)]
         case _:
             cushion = rounded_box((2 * x, rng.uniform(0.06, 0.1), (top - seat) * 0.85), 0.03, 3)
@@ -133,17 +147,16 @@ def _back(
             return [*posts, Part(cushion, _cloth(rng), pose)]
 
 
-def _rail(at, share_z: float, half: float, frame: Material) -> Part:
+def _rail(at: Back, share_z: float, half: float, frame: Material) -> Part:
     """A slat across the back, bowed a little."""
     across = np.linspace(-1, 1, 9)
-    path = np.array([at(s, share_z) + [0, 0.03 * (1 - s * s), 0] for s in across])
+    path = np.array([at(s, share_z) + xyz(0, 0.03 * (1 - s * s), 0) for s in across])
     return Part(sweep(path, half, 10, flatten=0.35), frame)
 
 
-def _panel(at, low: float, high: float, bow: float):
-    grid = [
-        [at(s, t) + [0, bow, 0] for s in np.linspace(-1, 1, 8)] for t in np.linspace(low, high, 8)
-    ]
+def _panel(at: Back, low: float, high: float) -> Mesh:
+    """A bent board between the posts."""
+    grid = [[at(s, t) for s in np.linspace(-1, 1, 8)] for t in np.linspace(low, high, 8)]
     return sheet(np.array(grid))
 
 
@@ -157,5 +170,5 @@ def _armrests(
         board = rounded_box((0.05, depth * 0.95, 0.03), 0.012)
         parts.append(Part(board, frame, placement((side * x, 0.02, height))))
         front = np.array([side * x, -depth / 2 + 0.06, seat])
-        parts.append(Part(capsule(front, front + [0, 0, height - seat], 0.016), frame))
+        parts.append(Part(capsule(front, front + xyz(0, 0, height - seat), 0.016), frame))
     return parts

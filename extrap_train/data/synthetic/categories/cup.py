@@ -1,82 +1,15 @@
 """Cups: mugs, tea cups and beakers with a handle; glazed in one colour, banded, checked or printed."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float
 
+from extrap_train.data.synthetic.glaze import PATTERNS, Glaze
 from extrap_train.data.synthetic.ground import draw_seed
-from extrap_train.data.synthetic.material import (
-    Color,
-    Material,
-    Mottled,
-    Plain,
-    Surface,
-    linear_color,
-    mix,
-    step,
-    varied,
-)
+from extrap_train.data.synthetic.material import Material, Mottled, Plain, linear_color, varied
 from extrap_train.data.synthetic.scene import Part, placement
 from extrap_train.data.synthetic.shapes import Mesh, lathe, sweep
 
 _GLAZES = ["#e9e4d8", "#2f5f8f", "#b5382f", "#d9a83a", "#4f7f6a", "#2b2b30", "#c98fa0", "#8fb0c0"]
-
-
-@dataclass(frozen=True)
-class Print:
-    """Bands, stripes, dots or diamonds around a cup, in the coordinates of its outside."""
-
-    base: Color
-    ink: Color
-    second: Color
-    pattern: str
-    """`bands`, `stripes`, `dots`, `zigzag` or `emblem`."""
-    count: int
-    low: float
-    high: float
-    """Heights that the pattern lies between."""
-    radius: float
-
-    def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
-        """Reflectance in linear light."""
-        x, y, z = surface.points.T
-        turn = np.arctan2(y, x) / (2 * np.pi)
-        blur = surface.footprint
-        inside = step(z - self.low, blur) * step(self.high - z, blur)
-        height = (z - self.low) / (self.high - self.low)
-        around = turn * self.count
-        cell = 2 * np.pi * self.radius / self.count
-        ink = getattr(self, f"_{self.pattern}")(height, around, cell, blur)
-        color = mix(self.base, self.ink, ink * inside)
-        rim = step(z - self.high - 0.02, blur) + step(self.low - 0.02 - z, blur)
-        return mix(color, self.second, rim)
-
-    def _bands(self, height, around, cell, blur):
-        wave = 0.5 - np.abs(height * 3 - np.floor(height * 3) - 0.5)
-        return step((wave - 0.22) * (self.high - self.low) / 3, blur)
-
-    def _stripes(self, height, around, cell, blur):
-        return step((np.abs(around - np.round(around)) - 0.25) * cell, blur)
-
-    def _dots(self, height, around, cell, blur):
-        rows = height * (self.high - self.low) / cell
-        shifted = around + 0.5 * (np.floor(rows) % 2)
-        far = np.hypot(shifted - np.round(shifted), rows - np.floor(rows) - 0.5)
-        return step((0.33 - far) * cell, blur)
-
-    def _zigzag(self, height, around, cell, blur):
-        line = 0.25 + 0.5 * 2 * np.abs(around - np.round(around))
-        return step((0.2 - np.abs(height - line)) * (self.high - self.low), blur)
-
-    def _emblem(self, height, around, cell, blur):
-        sides = around * 2 / self.count + 0.5  # beside the handle, not under it
-        x = (sides - np.round(sides)) * cell * self.count / 2
-        y = (height - 0.5) * (self.high - self.low)
-        size = 0.42 * (self.high - self.low)
-        disc = step(size - np.hypot(x, y), blur)
-        star = step(size * 0.75 - (np.abs(x) + np.abs(y)), blur)
-        return disc * (1 - 0.9 * star)
 
 
 def build(rng: np.random.Generator) -> list[Part]:
@@ -88,8 +21,8 @@ def build(rng: np.random.Generator) -> list[Part]:
     glaze, ink, second = rng.permutation(len(_GLAZES))[:3]
     colors = [varied(rng, [_GLAZES[i]], 0.08) for i in (glaze, ink, second)]
     low, high = np.sort(rng.uniform(0.15, 0.9, 2)) if rng.random() < 0.3 else (0.18, 0.82)
-    pattern = str(rng.choice(["bands", "stripes", "dots", "zigzag", "emblem"]))
-    outside = Print(
+    pattern = PATTERNS[rng.integers(len(PATTERNS))]
+    outside = Glaze(
         colors[0],
         colors[1],
         colors[2] if rng.random() < 0.4 else colors[0],
@@ -129,12 +62,12 @@ def _profile(height: float, rim: float, foot: float, belly: float) -> Float[np.n
 def _outer(profile: Float[np.ndarray, "k 2"], wall: float) -> Mesh:
     """Foot, side and the rounded rim."""
     top = profile[-1]
-    lip = [top + [-wall * 0.2, wall * 0.35], top + [-wall * 0.5, wall * 0.45]]
+    lip = [top + (-wall * 0.2, wall * 0.35), top + (-wall * 0.5, wall * 0.45)]
     return lathe(np.concatenate([[[0, 0]], profile, lip]), 48)
 
 
 def _inner(profile: Float[np.ndarray, "k 2"], wall: float) -> Mesh:
-    top = profile[-1] + [-wall * 0.5, wall * 0.45]
+    top = profile[-1] + (-wall * 0.5, wall * 0.45)
     side = (profile - [wall, 0])[::-1]
     side = side[side[:, 1] > wall * 1.5]
     return lathe(np.concatenate([[top], side, [[0, wall * 1.5]]]), 40)

@@ -86,7 +86,7 @@ def _bonnet(rng: np.random.Generator, radius: float, shoulder: float) -> Mesh:
         [0.95 * radius * np.cos(t * np.pi / 2) ** roundness, height * np.sin(t * np.pi / 2)], -1
     )
     base = shoulder + 0.01
-    profile = np.concatenate([[[rim, base], [rim, base + 0.03]], dome + [0, base + 0.031]])
+    profile = np.concatenate([[[rim, base], [rim, base + 0.03]], dome + (0, base + 0.031)])
     top = base + 0.031 + height
     nut = np.array(
         [

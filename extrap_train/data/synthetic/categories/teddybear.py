@@ -13,7 +13,7 @@ from extrap_train.data.synthetic.material import (
     varied,
 )
 from extrap_train.data.synthetic.scene import Part, placement
-from extrap_train.data.synthetic.shapes import capsule, ellipsoid, merge, moved, sweep
+from extrap_train.data.synthetic.shapes import capsule, ellipsoid, merge, moved, sweep, xyz
 
 _FURS = ["#8a5a32", "#b98a55", "#d9c49a", "#5c3a24", "#8f8a86", "#e3dccf", "#c98f9a", "#a8713f"]
 _PADS = ["#d9c49a", "#f0e6d2", "#c9a070", "#e8cfc0", "#5a4030"]
@@ -50,24 +50,24 @@ def _head(rng: np.random.Generator, at: np.ndarray, fur: Material, pad: Material
     radius = rng.uniform(0.19, 0.235)
     wide, long = rng.uniform(1.0, 1.15), rng.uniform(0.45, 0.62)
     parts = [Part(ellipsoid((radius * wide, radius * 0.92, radius), 26), fur, placement(tuple(at)))]
-    snout_at = at + [0, -radius * 0.75, -radius * 0.25]
+    snout_at = at + xyz(0, -radius * 0.75, -radius * 0.25)
     snout = ellipsoid((radius * 0.48, radius * long, radius * 0.38), 18)
     parts.append(Part(snout, pad, placement(tuple(snout_at))))
     black = Material(Plain(linear_color("#17120f")), 0.9, 40)
     nose = ellipsoid((radius * 0.19, radius * 0.12, radius * 0.13), 12)
     parts.append(
-        Part(nose, black, placement(tuple(snout_at + [0, -radius * long * 0.92, radius * 0.2])))
+        Part(nose, black, placement(tuple(snout_at + xyz(0, -radius * long * 0.92, radius * 0.2))))
     )
     eye = ellipsoid((0.028, 0.022, 0.03), 12)
     ear_size, spread = radius * rng.uniform(0.36, 0.5), rng.uniform(0.62, 0.8)
     ear = ellipsoid((ear_size, ear_size * 0.45, ear_size), 18)
     inner = ellipsoid((ear_size * 0.65, ear_size * 0.3, ear_size * 0.65), 14)
     for side in (-1, 1):
-        eye_at = at + [side * radius * 0.42, -radius * 0.82, radius * 0.2]
+        eye_at = at + xyz(side * radius * 0.42, -radius * 0.82, radius * 0.2)
         parts.append(Part(eye, black, placement(tuple(eye_at))))
-        ear_at = at + [side * radius * wide * spread, 0, radius * 0.78]
+        ear_at = at + xyz(side * radius * wide * spread, 0, radius * 0.78)
         parts.append(Part(ear, fur, placement(tuple(ear_at))))
-        parts.append(Part(inner, pad, placement(tuple(ear_at + [0, -ear_size * 0.25, 0]))))
+        parts.append(Part(inner, pad, placement(tuple(ear_at + xyz(0, -ear_size * 0.25, 0)))))
     return parts
 
 
@@ -79,12 +79,12 @@ def _limbs(
     parts = []
     for side in (-1, 1):
         shoulder = np.array([side * width * 0.8, -0.02, height * 1.55])
-        hand = shoulder + [
+        hand = shoulder + xyz(
             side * rng.uniform(0.05, 0.2), -rng.uniform(0.08, 0.24), rng.uniform(-0.26, 0.1)
-        ]  # fmt: skip
+        )
         parts.append(Part(capsule(shoulder, hand, arm, arm * 1.1), fur))
         hip = np.array([side * width * 0.65, -depth * 0.3, leg])
-        foot = hip + [side * rng.uniform(0.06, 0.16), -rng.uniform(0.22, 0.32), 0.01]
+        foot = hip + xyz(side * rng.uniform(0.06, 0.16), -rng.uniform(0.22, 0.32), 0.01)
         parts.append(Part(capsule(hip, foot, leg, leg * 1.08), fur))
         toward = (foot - hip) / np.linalg.norm(foot - hip)
         sole = ellipsoid((leg * 0.8, leg * 0.3, leg * 0.85), 16)
