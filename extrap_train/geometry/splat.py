@@ -6,9 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrap_train.geometry.splat_kernel import ScreenPoints
-from extrap_train.geometry.splat_numba import splat_pixels_numba
+from extrap_train.geometry.splat_kernel import OUTSIDE, ScreenPoints
+from extrap_train.geometry.splat_numba import project_numba, splat_pixels_numba
 from extrap_train.geometry.splat_torch import splat_pixels_torch
+from extrap_train.views import Camera
 
 
 @dataclass(frozen=True)
@@ -17,7 +18,38 @@ class Splat:
 
     values: Float[Tensor, "b h w c"]
     weight: Float[Tensor, "b h w"]
-    """Σ b·exp(−β·z): bilinear coverage by the nearest surface."""
+    """Σ b·exp(-β·z): bilinear coverage by the nearest surface."""
+
+
+def splat(
+    world_points: Float[Tensor, "n 3"], values: Float[Tensor, "n c"], camera: Camera
+) -> Splat:
+    """Draw a cloud of points as one (unbatched) camera sees it, each a bilinear dot; see `splat_pixels`."""
+    pixels_from_world = camera.intrinsics @ camera.world_to_cam[:3]
+    inputs = (world_points, values, pixels_from_world)
+    project = _project if _needs_torch(*inputs) else project_numba
+    u, v, depth = project(world_points, pixels_from_world)
+    reach = torch.ones_like(depth)
+    image = torch.zeros(len(depth), dtype=torch.long, device=depth.device)
+    points = ScreenPoints(u, v, depth, reach, reach, image)
+    return splat_pixels(points, values, 1, camera.height, camera.width)
+
+
+def _project(
+    world_points: Float[Tensor, "n 3"], pixels_from_world: Float[Tensor, "3 4"]
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"], Float[Tensor, "n"]]:
+    # Term by term, as `project_numba` does: a matrix product rounds otherwise, and then a dot's rim flips.
+    x, y, z = world_points.unbind(-1)
+    u, v, depth = (row[0] * x + row[1] * y + row[2] * z + row[3] for row in pixels_from_world)
+    shown = depth > 0
+    safe = torch.where(shown, depth, 1)
+    return torch.where(shown, u / safe, OUTSIDE), torch.where(shown, v / safe, OUTSIDE), safe
+
+
+def _needs_torch(*inputs: Tensor) -> bool:
+    """Whether the numba kernels cannot: another device or precision, or gradients are wanted."""
+    differentiated = torch.is_grad_enabled() and any(x.requires_grad for x in inputs)
+    return differentiated or any(x.is_cuda or x.dtype != torch.float32 for x in inputs)
 
 
 def splat_pixels(
@@ -34,8 +66,7 @@ def splat_pixels(
     On the CPU the same bits come out for any number of threads. The torch version agrees within rounding: it
     adds in another order, on CUDA in no fixed one.
     """
-    differentiated = points.u.requires_grad or values.requires_grad
-    in_torch = points.u.is_cuda or points.u.dtype != torch.float32 or differentiated
+    in_torch = _needs_torch(points.u, points.depth, values)
     run = splat_pixels_torch if in_torch else splat_pixels_numba
     summed = run(points, values, (images, height, width))
     weight = summed[..., -1]

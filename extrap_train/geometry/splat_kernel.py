@@ -9,6 +9,9 @@ from torch import Tensor
 DEPTH_SHARPNESS = 200.0
 """β: a surface 5 % behind the nearest one weighs e⁻¹⁰, so it does not bleed through."""
 
+OUTSIDE = -10.0
+"""Pixel coordinate of points that are not to be drawn."""
+
 
 @dataclass(frozen=True)
 class ScreenPoints:

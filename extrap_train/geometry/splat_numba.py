@@ -8,14 +8,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrap_train.geometry.splat_kernel import DEPTH_SHARPNESS, ScreenPoints
+from extrap_train.geometry.splat_kernel import DEPTH_SHARPNESS, OUTSIDE, ScreenPoints
 
-LANES = 8
-"""Channels are padded to a multiple of this, so that a point is added with whole vector instructions."""
 _ONE = np.float32(1)
 _HALF = np.float32(0.5)
+_OUTSIDE = np.float32(OUTSIDE)
 _SHARPNESS = np.float32(DEPTH_SHARPNESS)
 _NEGLIGIBLE = np.float32(60.0)
+"""Exponent beyond which a point weighs nothing."""
+_USUAL_CHANNELS = 7
+_LN2, _PER_LN2 = np.float32(math.log(2)), np.float32(1 / math.log(2))
+_SIXTH, _24TH, _120TH = (np.float32(1 / math.factorial(n)) for n in (3, 4, 5))
+_POWERS = np.float32(2.0) ** -np.arange(90, dtype=np.float32)
 
 
 def splat_pixels_numba(
@@ -23,17 +27,12 @@ def splat_pixels_numba(
 ) -> Float[Tensor, "b h w c1"]:
     """Weighted sums of the values, and the summed weight as the last channel, for `size` = (b, h, w)."""
     images, height, width = size
-    channels = values.shape[1]
-    padded = values.new_empty(len(values), -(-(channels + 1) // LANES) * LANES)
-    padded[:, :channels] = values
-    padded[:, channels] = 1
-    padded[:, channels + 1 :] = 0
     starts = torch.searchsorted(points.image, torch.arange(images + 1))
-    columns = (points.u, points.v, points.depth, points.reach_u, points.reach_v, padded, starts)
-    summed = torch.zeros(images, height, width, padded.shape[1])
+    columns = (points.u, points.v, points.depth, points.reach_u, points.reach_v, values, starts)
+    summed = torch.zeros(images, height, width, values.shape[1] + 1)
     bands = -(-numba.get_num_threads() // images)
     _splat(*(x.detach().contiguous().numpy() for x in columns), bands, summed.numpy())
-    return summed[..., : channels + 1]
+    return summed
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
@@ -73,7 +72,7 @@ def _find_nearest(u, v, depth, reach_u, reach_v, span, rows, nearest):  # noqa: 
 def _add(u, v, depth, values, span, rows, nearest, summed):  # noqa: ANN001, ANN202
     """Add the points' values to the pixels around them, by kernel and depth."""
     top, bottom = rows
-    width, lanes = summed.shape[1], summed.shape[2]
+    width = summed.shape[1]
     for i in range(span[0], span[1]):
         y, down = _split(v[i])
         if y < top - 1 or y >= bottom:
@@ -91,10 +90,31 @@ def _add(u, v, depth, values, span, rows, nearest, summed):  # noqa: ANN001, ANN
                 if not exponent < _NEGLIGIBLE:
                     continue
                 kernel_x = right if dx else _ONE - right
-                weight = kernel_x * kernel_y * np.float32(math.exp(-exponent))
-                for start in range(0, lanes, LANES):
-                    for lane in range(LANES):
-                        summed[y + dy, x + dx, start + lane] += weight * values[i, start + lane]
+                weight = kernel_x * kernel_y * _exp_minus(exponent)
+                _add_weighted(summed[y + dy, x + dx], values[i], weight)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _add_weighted(total, values, weight):  # noqa: ANN001, ANN202
+    channels = len(values)
+    if channels == _USUAL_CHANNELS:  # a length known to the compiler becomes vector instructions
+        for c in range(_USUAL_CHANNELS):
+            total[c] += weight * values[c]
+    else:
+        for c in range(channels):
+            total[c] += weight * values[c]
+    total[channels] += weight
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _exp_minus(x):  # noqa: ANN001, ANN202
+    """exp(−x) for 0 ≤ x < 60 to 2·10⁻⁶: a power of two from a table times a polynomial on ±ln 2 / 2."""
+    whole = int(x * _PER_LN2 + _HALF)
+    rest = np.float32(whole) * _LN2 - x
+    series = _ONE + rest * (
+        _ONE + rest * (_HALF + rest * (_SIXTH + rest * (_24TH + rest * _120TH)))
+    )
+    return series * _POWERS[whole]
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -103,3 +123,27 @@ def _split(position):  # noqa: ANN001, ANN202
     shifted = position - _HALF
     whole = np.float32(math.floor(shifted))
     return int(whole), shifted - whole
+
+
+def project_numba(
+    world_points: Float[Tensor, "n 3"], pixels_from_world: Float[Tensor, "3 4"]
+) -> Float[Tensor, "3 n"]:
+    """Pixel u, v and depth; points at or behind the camera land outside every image, at depth 1."""
+    screen = torch.empty(3, len(world_points))
+    _project(
+        world_points.contiguous().numpy(), pixels_from_world.contiguous().numpy(), screen.numpy()
+    )
+    return screen
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _project(points, m, screen):  # noqa: ANN001, ANN202
+    for i in numba.prange(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+        if depth > 0:
+            screen[0, i] = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth
+            screen[1, i] = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth
+            screen[2, i] = depth
+        else:
+            screen[0, i], screen[1, i], screen[2, i] = _OUTSIDE, _OUTSIDE, _ONE

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrap_train.geometry import splat_pieces, splat_unseen
-from extrap_train.geometry.splat_kernel import ScreenPoints
+from extrap_train.geometry.splat_kernel import OUTSIDE, ScreenPoints
 from extrap_train.geometry.splat_pieces import Pieces, Samples
 from extrap_train.geometry.splat_projection import LEAST_DEPTH_RATIO
 
@@ -24,7 +24,7 @@ _WALL_SPACING = np.float32(splat_unseen.SPACING)
 _WALL_MOST = np.float32(splat_unseen.MOST_POINTS)
 _WALL_ACROSS = splat_unseen.ACROSS
 _WALL_LIMIT = np.float32(1 + splat_unseen.TOLERANCE)
-_NOWHERE = np.float32(-10)
+_NOWHERE = np.float32(OUTSIDE)
 
 
 def sample_pieces_numba(pieces: Pieces, maps: Float[Tensor, "b k c h w"]) -> Samples:
