@@ -172,10 +172,10 @@ def _write_results(
     kept = [outcome for outcome in outcomes if outcome.cameras is not None]
     references = {outcome.name: _references(outcome, split) for outcome in kept}
     pairs = pd.concat([_pairs(outcome, split, references, options) for outcome in kept])
-    if pairs.empty:
+    if not (pairs["split"] == "train").any():
         raise InputError(
-            f"{folder}: no two frames of the {len(kept)} kept sequences make a pair; widen "
-            "prep.min_pair_angle_deg … prep.max_pair_angle_deg"
+            f"{folder}: no two frames of the {len(kept)} kept sequences make a training pair; "
+            "widen prep.min_pair_angle_deg and prep.max_pair_angle_deg, or add photographs"
         )
     frames = pa.concat_tables([_frame_rows(outcome, references[outcome.name]) for outcome in kept])
     _write_table(folder / "frames.parquet", frames)

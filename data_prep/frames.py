@@ -15,6 +15,9 @@ from extrap_train.depth import DepthSource
 from extrap_train.errors import InputError
 from extrap_train.views import View, stack_cameras
 
+LEAST_KNOWN_SHARE = 0.25
+"""Of the finer depths under a pixel, for it to have one."""
+
 
 def frames_key(sequence: Sequence, depth_source: DepthSource, image_size: int) -> str:
     """A hash of what frames are made from: options, names and cameras, not the files' bytes."""
@@ -33,21 +36,19 @@ def make_frames(sequence: Sequence, depth_source: DepthSource, image_size: int) 
     Raises InputError where a file cannot be used, no mask shows the object, or no depth is known
     at all.
     """
-    working_size = max(image_size, depth_source.image_size or 0)
-    views = [object_square(frame.load(), working_size) for frame in sequence.frames]
+    finer = max(1, (depth_source.image_size or 0) // image_size)
+    views = [object_square(frame.load(), image_size * finer) for frame in sequence.frames]
     where = f"sequence {sequence.category}/{sequence.name}"
     if all(view.mask is not None and not view.mask.any() for view in views):
         raise InputError(f"{where}: the masks are all black; remove them or the sequence")
     maps = depth_source.depth_maps(views)
-    views = [
-        replace(view, depth=found.reliable()).resized(image_size, image_size)
-        for view, found in zip(views, maps, strict=True)
-    ]
+    depths = torch.stack([block_median(found.reliable(), finer) for found in maps])
+    views = [replace(view, depth=None).resized(image_size, image_size) for view in views]
     frames = SequenceFrames(
         names=tuple(frame.name for frame in sequence.frames),
         camera=stack_cameras([view.camera for view in views]),
         images=np.stack([_to_bytes(view.image).transpose(1, 2, 0) for view in views]),
-        depths=np.stack([_known(view.depth) for view in views]),
+        depths=depths.numpy(force=True),
         masks=np.stack([_to_bytes(_mask(view)) for view in views]),
     )
     if not frames.depths.any():
@@ -78,10 +79,16 @@ def _mask(view: View) -> Float[Tensor, "h w"]:
     return torch.ones_like(view.image[0]) if view.mask is None else view.mask
 
 
-def _known(depth: Float[Tensor, "h w"] | None) -> Float[np.ndarray, "h w"]:
-    assert depth is not None
-    values = depth.numpy(force=True).astype(np.float32)
-    return np.where(np.isfinite(values) & (values > 0), values, 0)
+def block_median(depth: Float[Tensor, "h w"], side: int) -> Float[Tensor, "h2 w2"]:
+    """The median of the known depths in each block of `side`² pixels; 0 where too few are known.
+
+    A median is one of the depths (the lower of two in the middle), so that edges stay edges.
+    """
+    rows, columns = depth.shape[0] // side, depth.shape[1] // side
+    blocks = depth.float().view(rows, side, columns, side).transpose(1, 2).flatten(2)
+    known = blocks.isfinite() & (blocks > 0)
+    median = torch.where(known, blocks, torch.nan).nanmedian(-1).values
+    return torch.where(known.float().mean(-1) >= LEAST_KNOWN_SHARE, median, 0)
 
 
 def _to_bytes(values: Float[Tensor, "*n"]) -> np.ndarray:

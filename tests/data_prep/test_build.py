@@ -12,7 +12,7 @@ from orbits import capture, even, ring
 
 from data_prep import build
 from data_prep.build import prepare
-from data_prep.frames import object_square
+from data_prep.frames import block_median, object_square
 from extrap_train.config import PrepConfig
 from extrap_train.data.store import PreparedData
 from extrap_train.depth import DepthMap, DepthSource
@@ -188,3 +188,18 @@ def test_the_split_file_names_the_test_sequences(tmp_path: Path) -> None:
     split = build.json.loads((tmp_path / "cup" / "split.json").read_text())
     assert split["test"] == ["cup/0002"]
     assert len(split["sha256"]) == 64
+
+
+def test_finer_depths_are_reduced_to_one_of_their_own() -> None:
+    depth = torch.zeros(4, 6)
+    depth[:2, :2] = torch.tensor([[1.0, 5.0], [5.0, 5.0]])  # an edge: no depth between 1 and 5
+    depth[0, 2] = 7.0  # one of four known
+    depth[2:, 4:] = float("nan")
+    depth[2:, :2] = torch.tensor([[2.0, float("inf")], [3.0, 4.0]])
+    assert block_median(depth, 2).tolist() == [[5, 7, 0], [3, 0, 0]]
+    assert block_median(depth, 1)[0].tolist() == [1, 5, 7, 0, 0, 0]
+
+
+def test_photographs_too_close_together_make_no_pair(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="make a training pair"):
+        run(tmp_path / "cup", [capture(ring(even(9, 6)))])
