@@ -65,6 +65,8 @@ def histograms(data: PreparedData) -> Figure:
     angle_axes, score_axes = figure.subplots(1, 2)
     for split, colour in _COLOURS.items():
         pairs = data.pairs(split)
+        if not len(pairs):
+            continue
         style = {"color": colour, "alpha": 0.6, "density": True, "label": split}
         angle_axes.hist(np.degrees(pairs.angle_rad), np.arange(0, 91, 5), **style)
         score_axes.hist(pairs.score, np.linspace(0, 0.25, 26), **style)

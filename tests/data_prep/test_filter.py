@@ -1,4 +1,5 @@
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -7,6 +8,7 @@ from orbits import capture, even, looking_at, ring
 
 from data_prep.filter import judge, judge_all
 from extrap_train.config import PrepConfig
+from extrap_train.data.co3d import read_category
 
 OPTIONS = PrepConfig()
 
@@ -95,3 +97,12 @@ def test_partial_turns_are_kept_only_where_there_is_no_full_one(
     assert "no sequence is a full circle (covers 192°" in caplog.text
     required = replace(OPTIONS, full_circle="require")
     assert not any(v.kept for v in judge_all([arc, poor], required))
+
+
+def test_the_real_apple_is_sparse_but_turns_all_around(shared: Path) -> None:
+    """Twenty frames of a CO3D turn: the largest gaps are 214° to 277° and 72° to 114°."""
+    apple = read_category(shared / "data" / "co3d", "apple")
+    verdict = judge(apple[0], OPTIONS)
+    assert verdict.coverage_deg == pytest.approx(360 - 62.8, abs=1)
+    assert verdict.gap_deg == pytest.approx(41.3, abs=1)
+    assert [v.kept for v in judge_all(apple, OPTIONS)] == [True]
