@@ -1,4 +1,5 @@
 import errno
+import json
 import logging
 import os
 from collections.abc import Sequence as ListOf
@@ -10,7 +11,6 @@ import pytest
 import torch
 from orbits import capture, even, ring
 
-from data_prep import build
 from data_prep.build import prepare
 from data_prep.frames import block_median, object_square
 from extrap_train.config import PrepConfig
@@ -185,7 +185,7 @@ def test_the_square_follows_the_object_but_stays_inside() -> None:
 
 def test_the_split_file_names_the_test_sequences(tmp_path: Path) -> None:
     run(tmp_path / "cup", captures(4), test_names={"0002"})
-    split = build.json.loads((tmp_path / "cup" / "split.json").read_text())
+    split = json.loads((tmp_path / "cup" / "split.json").read_text())
     assert split["test"] == ["cup/0002"]
     assert len(split["sha256"]) == 64
 
