@@ -1,11 +1,10 @@
-"""Synthetic categories on disk, in the layout of CO3D's second release: made once, the same everywhere."""
+"""Synthetic categories on disk, in the layout of CO3D's second release."""
 
 import json
 import multiprocessing
 import os
 import shutil
 import zlib
-from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,6 +36,7 @@ class _Job:
 
     @property
     def name(self) -> str:
+        """The sequence's folder."""
         return sequence_name(self.index)
 
 
@@ -45,12 +45,18 @@ def sequence_name(index: int) -> str:
     return f"{index:04d}"
 
 
-def synthesize(config: SyntheticConfig, category: str, root: Path, workers: int) -> None:
-    """Render the sequences of a category that `root` does not have yet, and annotate all that are asked for.
+def walk_seed(category: str, index: int, seed: int) -> int:
+    """The seed of the walk around a sequence's scene."""
+    return zlib.crc32(f"{seed}/{category}/{index}".encode())
 
-    Sequences 0 … `test_sequences` − 1 are the test split; asking for more training sequences keeps every
-    sequence there is. Files are the same, bit for bit, for any number of `workers`. Sequences made with
-    other options are replaced, with a message. Raises InputError for an unknown category or a full disk.
+
+def synthesize(config: SyntheticConfig, category: str, root: Path, workers: int) -> None:
+    """Render the sequences of a category that `root` lacks, and annotate all that are asked for.
+
+    Sequences 0 … `test_sequences` − 1 are the test split; asking for more training sequences keeps
+    every sequence there is. Files are the same, bit for bit, for any number of `workers`. Sequences
+    made with other options are replaced, with a message. Raises InputError for an unknown category
+    and where the disk is full.
     """
     options = {
         "look": LOOK,
@@ -63,8 +69,7 @@ def synthesize(config: SyntheticConfig, category: str, root: Path, workers: int)
     states = [_state(root, job) for job in jobs]
     missing = [job for job, state in zip(jobs, states, strict=True) if state != "ready"]
     _announce(category, root, states)
-    for _ in _finished(missing, root, workers):
-        pass
+    _render_all(missing, root, workers)
     records = [_read_record(root / category / job.name) for job in jobs]
     _annotate(root, category, [record for record in records if record], config.test_sequences)
 
@@ -93,14 +98,14 @@ def _announce(category: str, root: Path, states: list[str]) -> None:
         print(f"{root / category}: {ready} of {len(states)} sequences are there already")
 
 
-def _finished(jobs: list[_Job], root: Path, workers: int) -> Iterator[None]:
-    """Renders the jobs, one process each while there are enough, with a progress bar."""
+def _render_all(jobs: list[_Job], root: Path, workers: int) -> None:
+    """Renders the jobs in up to `workers` processes, with a progress bar."""
     if not jobs:
         return
     label = f"render {jobs[0].category}"
     if workers <= 1 or len(jobs) == 1:
         for job in tqdm(jobs, label, unit="sequence"):
-            yield _render_sequence(root, job)
+            _render_sequence(root, job)
         return
     # Spawned, not forked: the parent may hold threads and a GPU.
     context = multiprocessing.get_context("spawn")
@@ -113,7 +118,7 @@ def _finished(jobs: list[_Job], root: Path, workers: int) -> Iterator[None]:
         futures = [pool.submit(_render_sequence, root, job) for job in jobs]
         try:
             for future in tqdm(as_completed(futures), label, len(jobs), unit="sequence"):
-                yield future.result()
+                future.result()
         finally:
             pool.shutdown(cancel_futures=True)
 
@@ -122,8 +127,8 @@ def _render_sequence(root: Path, job: _Job) -> None:
     """Render into a folder beside the final one, then rename it."""
     options = job.options
     scene = build_scene(job.category, job.index, options["seed"])
-    walk_seed = zlib.crc32(f"{options['seed']}/{job.category}/{job.index}".encode())
-    cameras = handheld_orbit(scene, options["frames"], options["image_size"], walk_seed)
+    seed = walk_seed(job.category, job.index, options["seed"])
+    cameras = handheld_orbit(scene, options["frames"], options["image_size"], seed)
     workshop = root / job.category / f".{job.name}.{os.getpid()}"
     try:
         frames = [

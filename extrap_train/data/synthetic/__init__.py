@@ -1,7 +1,7 @@
 """Six categories of textured objects in lit surroundings, with exact depth. The world's +Z is up.
 
-`build_scene` draws a scene, `handheld_orbit` a walk around it, `render` a photograph, `surface_points`
-the ground-truth cloud. Everything follows from (category, index, seed) alone.
+`build_scene` draws a scene, `handheld_orbit` a walk around it, `render` a photograph,
+`surface_points` the ground-truth cloud. Everything follows from (category, index, seed) alone.
 """
 
 from extrap_train.data.synthetic.build import build_scene

@@ -85,7 +85,7 @@ class Pages:
 
     def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
         """Reflectance in linear light."""
-        layered = surface.points * np.float32([1.5, 1.5, 40])
+        layered = surface.points * np.array([1.5, 1.5, 40], np.float32)
         lines = fractal_noise(layered, surface.footprint * 10, 1.0, 2, 11)
         return mix(self.paper * 0.6, self.paper, 0.6 + lines)
 

@@ -1,7 +1,7 @@
 """What a surface looks like: solid textures in linear light, evaluated where a ray hits."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -23,12 +23,13 @@ class Surface:
     """Width of a pixel on the surface."""
 
     def planar(self) -> Float[np.ndarray, "n 2"]:
-        """Coordinates along the box side that the normal points out of; the second is z on a wall."""
+        """Coordinates along the box side that the normal leaves; the second is z on a wall."""
         axis = np.abs(self.normals).argmax(1)
         x, y, z = self.points.T
         return np.stack([np.where(axis == 0, y, x), np.where(axis == 2, y, z)], -1)
 
 
+@runtime_checkable
 class Texture(Protocol):
     """A colour for every point of a surface."""
 
@@ -101,7 +102,7 @@ class Plain:
 
 @dataclass(frozen=True)
 class Mottled:
-    """Two colours blended by noise: plaster, grass, carpet, stone, fur; stretched: brushed or grained."""
+    """Two colours blended by noise: plaster, grass, stone, fur; stretched: brushed or grained."""
 
     low: Color
     high: Color
@@ -113,7 +114,7 @@ class Mottled:
 
     def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
         """Reflectance in linear light."""
-        points = surface.points * np.float32(self.stretch)
+        points = surface.points * np.array(self.stretch, np.float32)
         footprint = surface.footprint * np.float32(min(self.stretch))
         noise = fractal_noise(points, footprint, self.frequency, self.octaves, self.seed)
         return mix(self.low, self.high, 0.5 + self.contrast * noise)
@@ -134,7 +135,7 @@ class Wood:
         """Reflectance in linear light."""
         stretch = np.ones(3, np.float32)
         stretch[self.axis] = 0.15
-        points = surface.points * stretch + np.float32([0.37, 0.21, 0.13])
+        points = surface.points * stretch + np.array([0.37, 0.21, 0.13], np.float32)
         across = [i for i in range(3) if i != self.axis]
         radius = np.hypot(points[:, across[0]], points[:, across[1]])
         waver = fractal_noise(points, surface.footprint, self.rings / 3, 2, self.seed)
@@ -147,7 +148,7 @@ class Wood:
 
 @dataclass(frozen=True)
 class Tiles:
-    """Rectangles with joints over the box sides: pavement, bricks, floorboards, tiles, window grids."""
+    """Rectangles with joints over the box sides: pavement, bricks, floorboards, window grids."""
 
     inside: Texture
     joint: Color

@@ -69,7 +69,7 @@ def fractal_noise(
     octaves: int,
     seed: int,
 ) -> Float[np.ndarray, " n"]:
-    """Summed octaves of Perlin noise, mean 0, mostly within ±1; octaves finer than a pixel are left out.
+    """Summed octaves of Perlin noise, mean 0, mostly within ±1, none finer than a pixel.
 
     `frequency` counts cells per unit of `points`; `footprint` is a pixel's width on the surface.
     """

@@ -9,7 +9,7 @@ from extrap_train.views import Camera
 
 
 def handheld_orbit(scene: SyntheticScene, frames: int, image_size: int, seed: int) -> Camera:
-    """A full turn around the object with a person's unsteadiness; a batch of `frames` square cameras.
+    """A full turn around the object with a person's unsteadiness: `frames` square cameras.
 
     The ball around the object stays in frame, and its height takes about 45–70 % of it.
     """

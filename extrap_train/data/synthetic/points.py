@@ -26,8 +26,8 @@ class SurfacePoints:
 def surface_points(scene: SyntheticScene, count: int) -> SurfacePoints:
     """Points spread evenly by area over what can be seen from outside within 1.5 of the origin.
 
-    A point is kept where a ray from some direction above reaches it: inner walls and undersides that touch
-    the ground are left out.
+    A point is kept where one of the eyes around the scene sees it: inner walls and undersides that
+    touch the ground are left out.
     """
     rng = np.random.default_rng(count)
     mesh = scene.mesh

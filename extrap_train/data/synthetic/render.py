@@ -36,7 +36,7 @@ def render(scene: SyntheticScene, camera: Camera, supersample: int = 2) -> View:
 def _rays(
     camera: Camera, supersample: int
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Origins and directions, row by row; directions have z = 1 in the camera, so distance is depth."""
+    """Origins and directions, row by row; with z = 1 in the camera, distance is depth."""
     k = camera.intrinsics.double().numpy()
     cam_to_world = camera.cam_to_world.double().numpy()
     columns = (np.arange(camera.width * supersample) + 0.5) / supersample

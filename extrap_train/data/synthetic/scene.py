@@ -47,7 +47,7 @@ class Hits:
     """Where rays meet surfaces; every array has one row a ray."""
 
     face: Int[np.ndarray, " n"]
-    """−1 where a ray meets nothing."""
+    """-1 where a ray meets nothing."""
     distance: Float[np.ndarray, " n"]
     """In lengths of the ray's direction vector."""
     u: Float[np.ndarray, " n"]

@@ -196,7 +196,7 @@ def displaced(mesh: Mesh, offset: Float[np.ndarray, "v 3"]) -> Mesh:
 def _grid_mesh(
     vertices: Float[np.ndarray, "r c 3"], rows: Int[np.ndarray, " n"], closed: bool
 ) -> Mesh:
-    faces = _grid_faces(*vertices.shape[:2], rows, closed)
+    faces = _grid_faces(vertices.shape[0], vertices.shape[1], rows, closed)
     flat = vertices.reshape(-1, 3)
     mesh = _without_slivers(Mesh(flat, faces, np.zeros_like(flat)))
     return Mesh(flat, mesh.faces, _vertex_normals(flat, mesh.faces))

@@ -50,7 +50,7 @@ class Sky:
         height = np.clip(direction[:, 2], 0, 1)
         sky = mix(self.horizon, self.zenith, height**0.6)
         sky = mix(sky, np.full(3, 0.95), (clouds - 0.05) * 2.2)
-        ridge = direction * np.float32([1, 1, 0])
+        ridge = direction * np.array([1, 1, 0], np.float32)
         skyline = 0.05 + 0.08 * fractal_noise(
             ridge, surface.footprint / _SKY_RADIUS, 4.0, 4, self.seed + 50
         )
@@ -160,7 +160,7 @@ def _room(
             position[1 - axis] = place * half[1 - axis]
             position[2] = max(floor + height * rng.uniform(0.35, 0.7), 0.9)
             turn = np.pi / 2 if axis == 0 else 0.0
-            parts += _hanging(rng, tuple(position), turn)
+            parts += _hanging(rng, (position[0], position[1], position[2]), turn)
     return parts
 
 
@@ -276,9 +276,8 @@ def _lamp(rng: np.random.Generator, spot: Spot, turn: float, scale: float = 1.0)
 def _plant(rng: np.random.Generator, spot: Spot, turn: float, scale: float = 1.0) -> list[Part]:
     size = rng.uniform(0.35, 0.6) * scale
     pot = lathe(np.array([[0.3, 0], [0.45, 0.8], [0.38, 0.8], [0.36, 0.7], [0, 0.7]]) * size, 18)
-    clay = Material(
-        Mottled(*(varied(rng, ["#a85f40", "#d8d2c4", "#4f5f6f"]) * s for s in (0.7, 1.1)), 4.0, 3)
-    )
+    dark, pale = (varied(rng, ["#a85f40", "#d8d2c4", "#4f5f6f"]) for _ in range(2))
+    clay = Material(Mottled(dark * 0.7, pale * 1.1, 4.0, 3))
     leaves = _foliage(rng, (spot[0], spot[1], spot[2] + 1.3 * size), 1.6 * size)
     return [_scenery(pot, clay, spot, turn), leaves]
 

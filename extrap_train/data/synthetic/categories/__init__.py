@@ -1,1 +1,1 @@
-"""One file a category: `build(rng)` draws an object, as large as it comes; `build_scene` fits it."""
+"""One file a category: `build(rng)` draws an object in any size; `build_scene` fits it."""

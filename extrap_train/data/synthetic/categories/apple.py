@@ -28,7 +28,7 @@ class AppleSkin:
     blush: Color
     sunny_side: Float[np.ndarray, " 3"]
     blush_size: float
-    """−1 none … 1 all over."""
+    """-1 none … 1 all over."""
     streaks: float
     dots: float
     seed: int
@@ -42,11 +42,11 @@ class AppleSkin:
         ).astype(np.float32)
         streak = fractal_noise(around, footprint / radius, 7.0, 3, self.seed)
         cloud = fractal_noise(points, footprint, 2.5, 2, self.seed + 9)
-        toward = 2 * (points * np.float32(self.sunny_side)).sum(1)
+        toward = 2 * (points * self.sunny_side.astype(np.float32)).sum(1)
         share = 0.5 + 1.3 * (toward + self.blush_size) + 0.5 * cloud + self.streaks * streak
         color = mix(self.base, self.blush, share)
         dots = fractal_noise(points, footprint, 22.0, 1, self.seed + 20)
-        color = mix(color, np.float32([0.75, 0.62, 0.35]), self.dots * (dots - 0.45) * 6)
+        color = mix(color, np.array([0.75, 0.62, 0.35], np.float32), self.dots * (dots - 0.45) * 6)
         poles = np.clip(1 - radius / 0.16, 0, 1) * (0.7 + 0.5 * streak)
         return mix(color, linear_color("#8a7a3a"), poles)
 

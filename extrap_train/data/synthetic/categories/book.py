@@ -29,10 +29,12 @@ def build(rng: np.random.Generator) -> list[Part]:
         case 0:
             return _lying(rng, 0.0, 1.0, rng.uniform(0, 2 * np.pi))[0]
         case 1:
-            parts, base, scale = [], 0.0, 1.0
+            parts: list[Part] = []
+            base, scale = 0.0, 1.0
             for _ in range(int(rng.integers(2, 4))):
                 book, top = _lying(rng, base, scale, rng.uniform(-0.5, 0.5))
-                parts, base, scale = parts + book, top, scale * rng.uniform(0.8, 0.98)
+                parts += book
+                base, scale = top, scale * rng.uniform(0.8, 0.98)
             return parts
         case _:
             return _standing(rng)
@@ -96,19 +98,16 @@ def _standing(rng: np.random.Generator) -> list[Part]:
     board, spread = 0.022, rng.uniform(0.35, 1.2)
     cover = rounded_box((book.width, book.height, board), board * 0.4, 1)
     sheet = rounded_box((book.width * 0.94, book.height * 0.95, 0.03), 0.004, 1)
-    parts = []
-    for side in (-1, 1):
-        parts.append(Part(cover, book.cover, _upright(book, side * spread / 2)))
-    for share in np.linspace(-0.8, 0.8, int(rng.integers(4, 8))):
-        parts.append(Part(sheet, book.pages, _upright(book, share * spread / 2)))
+    shares = np.linspace(-0.8, 0.8, int(rng.integers(4, 8)))
+    covers = [Part(cover, book.cover, _upright(book, side * spread / 2)) for side in (-1, 1)]
+    pages = [Part(sheet, book.pages, _upright(book, share * spread / 2)) for share in shares]
     thick = book.width * 2 * np.sin(spread / 2) * 0.06 + 0.05
     spine = rounded_box((0.04, book.height, thick), 0.015, 2)
-    parts.append(Part(spine, book.spine, _upright(book, 0.0, share=0.0)))
-    return parts
+    return [*covers, *pages, Part(spine, book.spine, _upright(book, 0.0, share=0.0))]
 
 
 def _upright(book: _Binding, angle: float, share: float = 0.5) -> np.ndarray:
-    """A leaf's pose: local Y up, local X away from the spine; fronts look towards negative angles."""
+    """A leaf's pose: local Y up, local X away from the spine; fronts face negative angles."""
     out = np.array([np.cos(angle), np.sin(angle), 0.0])
     up = np.array([0.0, 0.0, 1.0])
     matrix = np.eye(4)

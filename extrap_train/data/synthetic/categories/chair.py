@@ -1,4 +1,4 @@
-"""Chairs: four legs or a pedestal, plain, slatted or upholstered backs, with or without armrests."""
+"""Chairs: four legs or a pedestal, plain, slatted or upholstered backs, sometimes armrests."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""Cups: mugs, tea cups and beakers with a handle; glazed in one colour, banded, checked or printed."""
+"""Cups: mugs, tea cups and beakers with a handle; glazed in patterns."""
 
 import numpy as np
 from jaxtyping import Float
@@ -62,12 +62,12 @@ def _profile(height: float, rim: float, foot: float, belly: float) -> Float[np.n
 def _outer(profile: Float[np.ndarray, "k 2"], wall: float) -> Mesh:
     """Foot, side and the rounded rim."""
     top = profile[-1]
-    lip = [top + (-wall * 0.2, wall * 0.35), top + (-wall * 0.5, wall * 0.45)]
+    lip = top + wall * np.array([[-0.2, 0.35], [-0.5, 0.45]])
     return lathe(np.concatenate([[[0, 0]], profile, lip]), 48)
 
 
 def _inner(profile: Float[np.ndarray, "k 2"], wall: float) -> Mesh:
-    top = profile[-1] + (-wall * 0.5, wall * 0.45)
+    top = profile[-1] + wall * np.array([-0.5, 0.45])
     side = (profile - [wall, 0])[::-1]
     side = side[side[:, 1] > wall * 1.5]
     return lathe(np.concatenate([[top], side, [[0, wall * 1.5]]]), 40)

@@ -1,4 +1,4 @@
-"""Fire hydrants: flanged base, barrel, capped nozzles, bonnet with its nut; painted and weathered."""
+"""Fire hydrants: flanged base, barrel, capped nozzles, bonnet with its nut; weathered paint."""
 
 import numpy as np
 
@@ -39,9 +39,8 @@ def build(rng: np.random.Generator) -> list[Part]:
         parts.append(_chain(rng, radius, nozzle_height))
     if rng.random() < 0.35:
         ring = np.array([[1.0, 0.0], [1.0, 1.0]]) * [radius + 0.004, rng.uniform(0.05, 0.1)]
-        band = Material(
-            Mottled(*(varied(rng, ["#e8e6dc", "#1f1f22"]) * s for s in (0.85, 1)), 8.0, 1)
-        )
+        dark, pale = (varied(rng, ["#e8e6dc", "#1f1f22"]) for _ in range(2))
+        band = Material(Mottled(dark * 0.85, pale, 8.0, 1))
         parts.append(Part(lathe(ring, 28), band, placement((0, 0, rng.uniform(0.2, 0.32)))))
     return parts
 
@@ -70,8 +69,8 @@ def _barrel(rng: np.random.Generator, radius: float, shoulder: float) -> Mesh:
 def _bolts(rng: np.random.Generator, radius: float) -> Mesh:
     """A ring of bolts on the base flange."""
     bolt = lathe(np.array([[0.022, 0.04], [0.022, 0.075], [0, 0.08]]), 6)
-    turns = np.arange(rng.integers(5, 9))
-    turns = turns * 2 * np.pi / len(turns)
+    count = int(rng.integers(5, 9))
+    turns = np.arange(count) * 2 * np.pi / count
     spots = [(float(np.cos(t)), float(np.sin(t))) for t in turns]
     far = radius + 0.045
     return merge([moved(bolt, placement((far * x, far * y, 0.0))) for x, y in spots])
@@ -82,11 +81,10 @@ def _bonnet(rng: np.random.Generator, radius: float, shoulder: float) -> Mesh:
     rim, height = radius + rng.uniform(0.03, 0.06), rng.uniform(0.16, 0.24)
     roundness = rng.uniform(0.7, 1.5)
     t = np.linspace(0, 1, 9)[:-1]
-    dome = np.stack(
-        [0.95 * radius * np.cos(t * np.pi / 2) ** roundness, height * np.sin(t * np.pi / 2)], -1
-    )
     base = shoulder + 0.01
-    profile = np.concatenate([[[rim, base], [rim, base + 0.03]], dome + (0, base + 0.031)])
+    across = 0.95 * radius * np.cos(t * np.pi / 2) ** roundness
+    dome = np.stack([across, height * np.sin(t * np.pi / 2) + (base + 0.031)], -1)
+    profile = np.concatenate([[[rim, base], [rim, base + 0.03]], dome])
     top = base + 0.031 + height
     nut = np.array(
         [

@@ -1,4 +1,4 @@
-"""Teddy bears: sitting, furry, with ears, snout, eyes, belly patch, and sometimes a bow or a shirt."""
+"""Teddy bears: sitting, furry, with ears, snout, eyes, belly patch, sometimes a bow or a shirt."""
 
 import numpy as np
 
@@ -96,7 +96,8 @@ def _limbs(
 def _shirt(rng: np.random.Generator, body: tuple[float, float, float]) -> Part:
     """A knitted pullover over the upper body."""
     width, depth, height = (x * 1.05 for x in body)
-    cloth = Plaid(*(varied(rng, CLOTHS) for _ in range(3)), rng.uniform(0.08, 0.16))
+    base, warp, weft = (varied(rng, CLOTHS) for _ in range(3))
+    cloth = Plaid(base, warp, weft, rng.uniform(0.08, 0.16))
     shell = ellipsoid((width, depth, height * 0.72), 26, 0.9)
     return Part(shell, Material(cloth), placement((0, 0, body[2] * 1.2)))
 
@@ -108,8 +109,8 @@ def _bow(rng: np.random.Generator, at: tuple[float, float, float]) -> Part:
     loops = [moved(loop, placement((side * size * 1.05, 0, 0))) for side in (-1, 1)]
     knot = ellipsoid((size * 0.35,) * 3, 12)
     tails = [
-        sweep(np.array([[0, 0, 0], [s * size * 0.6, -0.02, -size], [s * size, -0.02, -size * 1.7]]), 0.02, 6)
-        for s in (-1, 1)
-    ]  # fmt: skip
+        sweep(np.array([[0, 0, 0], [x * 0.6, -0.02, -size], [x, -0.02, -size * 1.7]]), 0.02, 6)
+        for x in (-size, size)
+    ]
     color = varied(rng, ["#b3272f", "#2f4fa0", "#d9b23a", "#2f7a4f", "#8a3f8f", "#e0e0dc"])
     return Part(merge([*loops, knot, *tails]), Material(Plain(color), 0.3), placement(at))
