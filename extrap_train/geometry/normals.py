@@ -19,7 +19,7 @@ ALWAYS_SURFACE = 3.0
 NEVER_SURFACE = 30.0
 """... and beyond which they never do (88°)."""
 LARGEST_BEND = 0.7
-"""In between: change of slope to the next pair of pixels, as a share of the slope, that a surface may have."""
+"""In between: largest change of slope from pixel to pixel that a surface may have, as a share of the slope."""
 
 
 @dataclass(frozen=True)
@@ -100,8 +100,7 @@ def _sides(
     # slope · focal / (1/z) is the tangent of the angle between ray and normal, near the optical axis.
     farther = torch.minimum(inverse[..., 1:], inverse[..., :-1])
     limit = farther / focal[..., None, None]
-    bend = _least_bend(slope, both)
-    straight = bend <= LARGEST_BEND * slope.abs()
+    straight = _on_a_line(slope, both)
     steep = slope.abs()
     linked = both & (
         (steep < ALWAYS_SURFACE * limit) | ((steep < NEVER_SURFACE * limit) & straight)
@@ -134,11 +133,15 @@ def _continued(
     return torch.where(connected, slope + grown, 0)
 
 
-def _least_bend(
+def _on_a_line(
     slope: Float[Tensor, "*b h n"], both: Bool[Tensor, "*b h n"]
-) -> Float[Tensor, "*b h n"]:
-    """Smaller change of slope to the pair of pixels before or after; infinite where there is neither."""
+) -> Bool[Tensor, "*b h n"]:
+    """Whether a step between two pixels is one of three in a row with similar slopes.
+
+    Two are not enough: so looks one pixel of mixed depth between a near and a far surface.
+    """
     step = (slope[..., 1:] - slope[..., :-1]).abs()
-    step = torch.where(both[..., 1:] & both[..., :-1], step, torch.inf)
-    outside = functional.pad(step, (1, 1), value=torch.inf)
-    return torch.minimum(outside[..., 1:], outside[..., :-1])
+    largest = torch.maximum(slope[..., 1:].abs(), slope[..., :-1].abs())
+    similar = both[..., 1:] & both[..., :-1] & (step <= LARGEST_BEND * largest)
+    three = functional.pad(similar[..., 1:] & similar[..., :-1], (2, 2))
+    return three[..., 2:] | three[..., 1:-1] | three[..., :-2]

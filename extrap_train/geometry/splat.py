@@ -29,7 +29,7 @@ def splat(
     inputs = (world_points, values, pixels_from_world)
     project = _project if _needs_torch(*inputs) else project_numba
     u, v, depth = project(world_points, pixels_from_world)
-    reach = torch.ones_like(depth)
+    reach = depth.new_ones(1).expand_as(depth)
     image = torch.zeros(len(depth), dtype=torch.long, device=depth.device)
     points = ScreenPoints(u, v, depth, reach, reach, image)
     return splat_pixels(points, values, 1, camera.height, camera.width)

@@ -1,7 +1,6 @@
 """What defines the splat, the same for every implementation."""
 
 from dataclasses import dataclass, replace
-from typing import Self
 
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -26,6 +25,6 @@ class ScreenPoints:
     reach_v: Float[Tensor, "n"]
     image: Int[Tensor, "n"]
 
-    def __getitem__(self, chosen: Int[Tensor, "m"]) -> Self:
+    def __getitem__(self, chosen: Int[Tensor, "m"]) -> "ScreenPoints":
         """The points with these indices."""
         return replace(self, **{name: column[chosen] for name, column in vars(self).items()})

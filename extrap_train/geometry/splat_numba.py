@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from extrap_train.geometry.splat_compiled import compiled
 from extrap_train.geometry.splat_kernel import DEPTH_SHARPNESS, OUTSIDE, ScreenPoints
 
 _ONE = np.float32(1)
@@ -16,7 +17,7 @@ _OUTSIDE = np.float32(OUTSIDE)
 _SHARPNESS = np.float32(DEPTH_SHARPNESS)
 _NEGLIGIBLE = np.float32(60.0)
 """Exponent beyond which a point weighs nothing."""
-_USUAL_CHANNELS = 7
+_USUAL_LANES = 8
 _LN2, _PER_LN2 = np.float32(math.log(2)), np.float32(1 / math.log(2))
 _SIXTH, _24TH, _120TH = (np.float32(1 / math.factorial(n)) for n in (3, 4, 5))
 _POWERS = np.float32(2.0) ** -np.arange(90, dtype=np.float32)
@@ -31,11 +32,11 @@ def splat_pixels_numba(
     columns = (points.u, points.v, points.depth, points.reach_u, points.reach_v, values, starts)
     summed = torch.zeros(images, height, width, values.shape[1] + 1)
     bands = -(-numba.get_num_threads() // images)
-    _splat(*(x.detach().contiguous().numpy() for x in columns), bands, summed.numpy())
+    _splat(*(x.detach().numpy() for x in columns), bands, summed.numpy())
     return summed
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@compiled(parallel=True)
 def _splat(u, v, depth, reach_u, reach_v, values, starts, bands, summed):  # noqa: ANN001, ANN202
     images, height, width, _ = summed.shape
     nearest = np.full((images, height, width), np.float32(np.inf), np.float32)
@@ -47,15 +48,15 @@ def _splat(u, v, depth, reach_u, reach_v, values, starts, bands, summed):  # noq
         _add(u, v, depth, values, span, rows, nearest[image], summed[image])
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled()
 def _find_nearest(u, v, depth, reach_u, reach_v, span, rows, nearest):  # noqa: ANN001, ANN202
     """Least depth of the points that reach each pixel's centre."""
     top, bottom = rows
     width = nearest.shape[1]
     for i in range(span[0], span[1]):
-        y, down = _split(v[i])
-        if y < top - 1 or y >= bottom:
+        if not _touches(u[i], v[i], top, bottom, width):
             continue
+        y, down = _split(v[i])
         x, right = _split(u[i])
         for dy in range(2):
             apart_y = _ONE - down if dy else down
@@ -68,48 +69,46 @@ def _find_nearest(u, v, depth, reach_u, reach_v, span, rows, nearest):  # noqa: 
                     nearest[y + dy, x + dx] = min(nearest[y + dy, x + dx], depth[i])
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled(contract=True)
 def _add(u, v, depth, values, span, rows, nearest, summed):  # noqa: ANN001, ANN202
     """Add the points' values to the pixels around them, by kernel and depth."""
     top, bottom = rows
-    width = summed.shape[1]
+    width, channels = nearest.shape[1], values.shape[1]
+    lanes = np.ones(channels + 1, np.float32)  # the point's values, and 1 to sum the weights
     for i in range(span[0], span[1]):
-        y, down = _split(v[i])
-        if y < top - 1 or y >= bottom:
+        if not _touches(u[i], v[i], top, bottom, width):
             continue
+        y, down = _split(v[i])
         x, right = _split(u[i])
+        for c in range(channels):
+            lanes[c] = values[i, c]
         for dy in range(2):
             if not top <= y + dy < bottom:
                 continue
+            row = np.uint32(y + dy)  # unsigned: no check for an index from the end
             kernel_y = down if dy else _ONE - down
             for dx in range(2):
                 if not 0 <= x + dx < width:
                     continue
-                least = nearest[y + dy, x + dx]
+                column = np.uint32(x + dx)
+                least = nearest[row, column]
                 exponent = _SHARPNESS * (abs(depth[i] - least) / least)
                 if not exponent < _NEGLIGIBLE:
                     continue
                 kernel_x = right if dx else _ONE - right
                 weight = kernel_x * kernel_y * _exp_minus(exponent)
-                _add_weighted(summed[y + dy, x + dx], values[i], weight)
+                if channels + 1 == _USUAL_LANES:  # known when compiled: one vector instruction
+                    for c in range(_USUAL_LANES):
+                        summed[row, column, c] += weight * lanes[c]
+                else:
+                    for c in range(channels + 1):
+                        summed[row, column, c] += weight * lanes[c]
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _add_weighted(total, values, weight):  # noqa: ANN001, ANN202
-    channels = len(values)
-    if channels == _USUAL_CHANNELS:  # a length known to the compiler becomes vector instructions
-        for c in range(_USUAL_CHANNELS):
-            total[c] += weight * values[c]
-    else:
-        for c in range(channels):
-            total[c] += weight * values[c]
-    total[channels] += weight
-
-
-@numba.njit(cache=True, error_model="numpy")
+@compiled(contract=True)
 def _exp_minus(x):  # noqa: ANN001, ANN202
     """exp(−x) for 0 ≤ x < 60 to 2·10⁻⁶: a power of two from a table times a polynomial on ±ln 2 / 2."""
-    whole = int(x * _PER_LN2 + _HALF)
+    whole = np.uint32(x * _PER_LN2 + _HALF)
     rest = np.float32(whole) * _LN2 - x
     series = _ONE + rest * (
         _ONE + rest * (_HALF + rest * (_SIXTH + rest * (_24TH + rest * _120TH)))
@@ -117,12 +116,19 @@ def _exp_minus(x):  # noqa: ANN001, ANN202
     return series * _POWERS[whole]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled()
+def _touches(u, v, top, bottom, width):  # noqa: ANN001, ANN202
+    """Whether a point lies within a pixel of the rows and columns; also false for what is not a number."""
+    in_rows = np.float32(top) - _HALF <= v < np.float32(bottom) + _HALF
+    return in_rows and -_HALF <= u < np.float32(width) + _HALF
+
+
+@compiled()
 def _split(position):  # noqa: ANN001, ANN202
     """Whole and fractional part of a coordinate, counted from pixel centres."""
     shifted = position - _HALF
     whole = np.float32(math.floor(shifted))
-    return int(whole), shifted - whole
+    return np.int32(whole), shifted - whole
 
 
 def project_numba(
@@ -136,7 +142,7 @@ def project_numba(
     return screen
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@compiled(parallel=True)
 def _project(points, m, screen):  # noqa: ANN001, ANN202
     for i in numba.prange(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]

@@ -19,11 +19,11 @@ def reference_to_query_pixels(cameras: Camera, query: Camera) -> Float[Tensor, "
 
 
 def project_pixels(
-    matrix: Float[Tensor, "*b 3 4"],
-    u: Float[Tensor, "*b"],
-    v: Float[Tensor, "*b"],
-    inverse: Float[Tensor, "*b"],
-) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b"], Float[Tensor, "*b"]]:
+    matrix: Float[Tensor, "*#b 3 4"],
+    u: Float[Tensor, "*#b"],
+    v: Float[Tensor, "*#b"],
+    inverse: Float[Tensor, "*#b"],
+) -> tuple[Float[Tensor, "*#b"], Float[Tensor, "*b"], Float[Tensor, "*b"]]:
     """Query pixel and query depth as a multiple of the reference's; meaningless where that is ≤ 0."""
     x, y, ratio = (
         matrix[..., i, 0] * u

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrap_train.geometry import splat_pieces, splat_unseen
+from extrap_train.geometry.splat_compiled import compiled
 from extrap_train.geometry.splat_kernel import OUTSIDE, ScreenPoints
 from extrap_train.geometry.splat_pieces import Pieces, Samples
 from extrap_train.geometry.splat_projection import LEAST_DEPTH_RATIO
@@ -51,7 +52,7 @@ def sample_pieces_numba(pieces: Pieces, maps: Float[Tensor, "b k c h w"]) -> Sam
     return Samples(ScreenPoints(*torch.from_numpy(points), image), torch.from_numpy(values))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled()
 def _project(m, u, v, inverse):  # noqa: ANN001, ANN202
     x = m[0, 0] * u + m[0, 1] * v + m[0, 2] + m[0, 3] * inverse
     y = m[1, 0] * u + m[1, 1] * v + m[1, 2] + m[1, 3] * inverse
@@ -60,7 +61,7 @@ def _project(m, u, v, inverse):  # noqa: ANN001, ANN202
     return x / safe, y / safe, ratio
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled()
 def _step(m, u, v, ratio, axis, slope):  # noqa: ANN001, ANN202
     """Movement in the query for one reference pixel along an axis, and how many points that takes."""
     z = m[2, axis] + slope * m[2, 3]
@@ -72,7 +73,7 @@ def _step(m, u, v, ratio, axis, slope):  # noqa: ANN001, ANN202
     return abs(across), abs(down), max(int(math.ceil(count)), 1)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled()
 def _steps(m, inverse, slopes, y, x):  # noqa: ANN001, ANN202
     u, v, ratio = _project(m, np.float32(x) + _HALF, np.float32(y) + _HALF, inverse[y, x])
     along_u = _step(m, u, v, ratio, 0, (slopes[0, y, x] + slopes[1, y, x]) / _TWO)
@@ -80,7 +81,7 @@ def _steps(m, inverse, slopes, y, x):  # noqa: ANN001, ANN202
     return along_u, along_v
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@compiled(parallel=True)
 def _count(inverse, drawn, slopes, matrix):  # noqa: ANN001, ANN202
     """Points in each row of each reference."""
     references, height, _ = inverse.shape
@@ -91,7 +92,7 @@ def _count(inverse, drawn, slopes, matrix):  # noqa: ANN001, ANN202
     return counts
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled()
 def _count_row(inverse, drawn, slopes, m, y):  # noqa: ANN001, ANN202
     count = 0
     for x in range(inverse.shape[1]):
@@ -101,7 +102,7 @@ def _count_row(inverse, drawn, slopes, m, y):  # noqa: ANN001, ANN202
     return count
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@compiled(parallel=True)
 def _fill(inverse, drawn, slopes, connected, matrix, maps, unseen, stops, points, values):  # noqa: ANN001, ANN202
     references, height, _ = inverse.shape
     for task in numba.prange(references * height):
@@ -111,7 +112,7 @@ def _fill(inverse, drawn, slopes, connected, matrix, maps, unseen, stops, points
         _fill_row(surface, matrix[r], maps[r], unseen[r], y, first, points, values)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled()
 def _fill_row(surface, m, maps, unseen, y, n, points, values):  # noqa: ANN001, ANN202
     inverse, drawn, slopes, connected = surface
     for x in range(inverse.shape[1]):
@@ -141,7 +142,7 @@ def _fill_row(surface, m, maps, unseen, y, n, points, values):  # noqa: ANN001, 
             n += 1
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled()
 def _seen(u, v, ratio, inverse, unseen):  # noqa: ANN001, ANN202
     height, width = unseen.shape
     inside = -_HALF < u < np.float32(width) + _HALF and -_HALF < v < np.float32(height) + _HALF
@@ -151,7 +152,7 @@ def _seen(u, v, ratio, inverse, unseen):  # noqa: ANN001, ANN202
     return not ratio / inverse > unseen[row, column] * _WALL_LIMIT
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@compiled(parallel=True)
 def _draw_walls(inverse, valid, connected, ends, intrinsics, matrix, unseen):  # noqa: ANN001, ANN202
     """Depth buffer of the walls behind occluding edges (`splat_unseen`)."""
     for r in numba.prange(len(inverse)):
@@ -161,7 +162,7 @@ def _draw_walls(inverse, valid, connected, ends, intrinsics, matrix, unseen):  #
             _draw_walls_of_side(surface, side, focal, matrix[r], unseen[r])
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled()
 def _draw_walls_of_side(surface, side, focal, m, unseen):  # noqa: ANN001, ANN202
     inverse, valid, connected, ends = surface
     du = (2 * side - 1) if side < 2 else 0
@@ -179,7 +180,7 @@ def _draw_walls_of_side(surface, side, focal, m, unseen):  # noqa: ANN001, ANN20
             _draw_wall(m, u, v, start, stop, side < 2, unseen)
 
 
-@numba.njit(cache=True)
+@compiled()
 def _run(connected, y, x, dy, dx):  # noqa: ANN001, ANN202
     """Pixels connected in a row from (y, x) on, itself included."""
     count = 1
@@ -188,7 +189,7 @@ def _run(connected, y, x, dy, dx):  # noqa: ANN001, ANN202
     return count
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled()
 def _draw_wall(m, u, v, start, stop, upright, unseen):  # noqa: ANN001, ANN202
     height, width = unseen.shape
     x0, y0, _ = _project(m, u, v, start)

@@ -1,0 +1,22 @@
+"""How the kernels are compiled."""
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import numba
+
+
+def compiled(parallel: bool = False, contract: bool = False) -> Callable[[Callable], Any]:
+    """Compile a kernel and keep the machine code on disk.
+
+    `contract` fuses multiplications with additions, for sums that no decision hangs on: elsewhere the same
+    rounding as in torch is wanted. Type checkers that wrap every function are looked through.
+    """
+    fastmath = {"contract"} if contract else False
+
+    def compile_kernel(kernel: Callable) -> Any:  # noqa: ANN401  a numba dispatcher has no type
+        options = {"cache": True, "error_model": "numpy", "fastmath": fastmath}
+        return numba.njit(parallel=parallel, **options)(inspect.unwrap(kernel))
+
+    return compile_kernel
