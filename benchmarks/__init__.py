@@ -1,1 +1,2 @@
-"""Comparisons: of whole methods in tables, and of our kernels with plain reference implementations."""
+"""Comparisons: of whole methods in tables, and of our kernels with plain reference
+implementations."""

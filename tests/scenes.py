@@ -16,7 +16,8 @@ Hit = Callable[[Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Scene:
-    """Solid shapes in a world of unit scale, centred at the origin, with a smooth texture in space."""
+    """Solid shapes in a world of unit scale, centred at the origin, with a smooth texture in
+    space."""
 
     shapes: tuple[Hit, ...]
 
@@ -37,7 +38,8 @@ class Scene:
         return texture(points).T.reshape(3, camera.height, camera.width).float()
 
     def visible_from(self, other: Camera, camera: Camera) -> Bool[Tensor, "h w"]:
-        """Which pixels of `camera` show a point that lies inside `other`'s image and is not hidden from it."""
+        """Which pixels of `camera` show a point that lies inside `other`'s image and is not
+        hidden from it."""
         origins, directions = rays(camera)
         distance = self.hit(origins, directions)
         hit = torch.isfinite(distance)
@@ -111,7 +113,8 @@ def orbit_camera(
     size: int = 128,
     focal: float = 1.2,
 ) -> Camera:
-    """A camera on a circle around the origin, looking at it; azimuth 0 looks along +z, world +y is down."""
+    """A camera on a circle around the origin, looking at it; azimuth 0 looks along +z, world +y
+    is down."""
     azimuth, elevation = torch.deg2rad(
         torch.tensor([azimuth_deg, elevation_deg], dtype=torch.float64)
     )

@@ -23,8 +23,8 @@ def positional_encoding(
 ) -> Float[Tensor, "b {4*octaves} h w"]:
     """Encode normalised (u, v) with frequencies π, 2π, 4π, …
 
-    Channels go by octave, and within one: sin u, sin v, cos u, cos v. At the lowest frequency [−1, 1] is one
-    period.
+    Channels go by octave, and within one: sin u, sin v, cos u, cos v. At the lowest frequency
+    [−1, 1] is one period.
     """
     b, _, h, w = coordinates.shape
     frequencies = math.pi * 2.0 ** torch.arange(octaves, device=coordinates.device)
@@ -33,8 +33,10 @@ def positional_encoding(
 
 
 def warp_encoding(warp: Warp, octaves: int) -> Float[Tensor, "b {4*octaves} h w"]:
-    """Encode where in the nearest reference each query pixel comes from; zero where it comes from nowhere.
+    """Encode where in the nearest reference each query pixel comes from; zero where it comes from
+    nowhere.
 
-    The coordinates were warped and are encoded here: interpolated sines would be no encoding of a coordinate.
+    The coordinates were warped and are encoded here: interpolated sines would be no encoding of a
+    coordinate.
     """
     return positional_encoding(warp.coordinates, octaves) * warp.nearest_mask[:, None]

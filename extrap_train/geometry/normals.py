@@ -1,7 +1,9 @@
-"""Surfaces in a depth map: which neighbouring pixels lie on the same one, how it slopes, its normals (paper II-A).
+"""Surfaces in a depth map: which neighbouring pixels lie on the same one, how it slopes, its
+normals (paper II-A).
 
-All of it works on inverse depth: on a plane, at whatever angle, that is exactly linear in pixel coordinates, so
-a steep surface and a jump can be told apart by curvature, and nothing depends on the scene's unit.
+All of it works on inverse depth: on a plane, at whatever angle, that is exactly linear in pixel
+coordinates, so a steep surface and a jump can be told apart by curvature, and nothing depends on
+the scene's unit.
 """
 
 from dataclasses import dataclass
@@ -15,11 +17,13 @@ from extrap_train.geometry.cameras import pixel_grid
 from extrap_train.views import Camera
 
 ALWAYS_SURFACE = 3.0
-"""Tangent of the angle between viewing ray and normal up to which two neighbours always form a surface (72°)."""
+"""Tangent of the angle between viewing ray and normal up to which two neighbours always form a
+surface (72°)."""
 NEVER_SURFACE = 30.0
 """... and beyond which they never do (88°)."""
 LARGEST_BEND = 0.7
-"""In between: largest change of slope from pixel to pixel that a surface may have, as a share of the slope."""
+"""In between: largest change of slope from pixel to pixel that a surface may have, as a share of
+the slope."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +33,8 @@ class Surface:
     inverse_depth: Float[Tensor, "*b h w"]
     """0 where depth is unknown."""
     slopes: Float[Tensor, "*b 4 h w"]
-    """Towards the left, right, upper and lower neighbour, all counted along +u and +v; where there is no
-    connection, the surface is continued from the opposite side."""
+    """Towards the left, right, upper and lower neighbour, all counted along +u and +v; where
+    there is no connection, the surface is continued from the opposite side."""
     connected: Bool[Tensor, "*b 4 h w"]
     """Whether that neighbour lies on the same surface."""
     ends: Bool[Tensor, "*b 4 h w"]
@@ -42,8 +46,8 @@ class Surface:
 def surface_from_depth(depth: Float[Tensor, "*b h w"], camera: Camera) -> Surface:
     """Connect the pixels that lie on a common surface.
 
-    Of the two pixels at a jump the nearer one ends its surface; the one behind is dropped, as are the mixed
-    depths in between: what they show is partly the occluder.
+    Of the two pixels at a jump the nearer one ends its surface; the one behind is dropped, as are
+    the mixed depths in between: what they show is partly the occluder.
     """
     known = torch.isfinite(depth) & (depth > 0)
     inverse = torch.where(known, 1 / torch.where(known, depth, 1), 0)
@@ -61,7 +65,8 @@ def surface_from_depth(depth: Float[Tensor, "*b h w"], camera: Camera) -> Surfac
 def normals_from_depth(
     depth: Float[Tensor, "*b h w"], camera: Camera
 ) -> tuple[Float[Tensor, "*b h w 3"], Bool[Tensor, "*b h w"]]:
-    """Unit normals in the camera's frame, facing the camera, and where they mean something (else 0)."""
+    """Unit normals in the camera's frame, facing the camera, and where they mean something (else
+    0)."""
     surface = surface_from_depth(depth, camera)
     away = plane_vectors(surface, camera)
     length = torch.linalg.vector_norm(away, dim=-1, keepdim=True)
@@ -70,7 +75,8 @@ def normals_from_depth(
 
 
 def plane_vectors(surface: Surface, camera: Camera) -> Float[Tensor, "*b h w 3"]:
-    """The vector n of each pixel's tangent plane {x: n·x = 1} in the camera's frame: away from the camera."""
+    """The vector n of each pixel's tangent plane {x: n·x = 1} in the camera's frame: away from
+    the camera."""
     left, right, up, low = surface.slopes.unbind(-3)
     k = camera.intrinsics[..., None, None, :, :]
     grid = pixel_grid(camera.height, camera.width, surface.inverse_depth.device)
@@ -97,7 +103,8 @@ def _sides(
     """Slopes and connections to the previous and the next pixel along the last dimension."""
     slope = inverse[..., 1:] - inverse[..., :-1]
     both = known[..., 1:] & known[..., :-1]
-    # slope · focal / (1/z) is the tangent of the angle between ray and normal, near the optical axis.
+    # slope · focal / (1/z) is the tangent of the angle between ray and normal, near the optical
+    # axis.
     farther = torch.minimum(inverse[..., 1:], inverse[..., :-1])
     limit = farther / focal[..., None, None]
     straight = _on_a_line(slope, both)
@@ -123,7 +130,8 @@ def _sides(
 def _continued(
     slope: Float[Tensor, "*b h w"], connected: Bool[Tensor, "*b h w"], inwards: int
 ) -> Float[Tensor, "*b h w"]:
-    """The slope beyond the end of a surface: as it is just inside, changing on as it did there (at most twofold)."""
+    """The slope beyond the end of a surface: as it is just inside, changing on as it did there
+    (at most twofold)."""
     inner = torch.roll(slope, -inwards, -1)
     known = connected & torch.roll(connected, -inwards, -1)
     grown = torch.where(known, slope - inner, 0)

@@ -1,4 +1,5 @@
-"""Softmax splatting of points by depth (paper Eq. 1): numba on the CPU, torch on the GPU and for gradients."""
+"""Softmax splatting of points by depth (paper Eq. 1): numba on the CPU, torch on the GPU and for
+gradients."""
 
 from dataclasses import dataclass
 
@@ -24,7 +25,8 @@ class Splat:
 def splat(
     world_points: Float[Tensor, "n 3"], values: Float[Tensor, "n c"], camera: Camera
 ) -> Splat:
-    """Draw a cloud of points as one (unbatched) camera sees it, each a bilinear dot; see `splat_pixels`."""
+    """Draw a cloud of points as one (unbatched) camera sees it, each a bilinear dot; see
+    `splat_pixels`."""
     pixels_from_world = camera.intrinsics @ camera.world_to_cam[:3]
     inputs = (world_points, values, pixels_from_world)
     project = _project if _needs_torch(*inputs) else project_numba
@@ -38,7 +40,8 @@ def splat(
 def _project(
     world_points: Float[Tensor, "n 3"], pixels_from_world: Float[Tensor, "3 4"]
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"], Float[Tensor, "n"]]:
-    # Term by term, as `project_numba` does: a matrix product rounds otherwise, and then a dot's rim flips.
+    # Term by term, as `project_numba` does: a matrix product rounds otherwise, and then a dot's
+    # rim flips.
     x, y, z = world_points.unbind(-1)
     u, v, depth = (row[0] * x + row[1] * y + row[2] * z + row[3] for row in pixels_from_world)
     shown = depth > 0
@@ -57,14 +60,15 @@ def splat_pixels(
 ) -> Splat:
     """Draw projected points into `images` images of `height` × `width`.
 
-    Per pixel, `Σ b·e·v / Σ b·e` with the bilinear kernel b and `e = exp(−β |z/z_nearest − 1|)`, where z_nearest
-    is the least depth of the points that reach the pixel's centre: it is the maximum that is subtracted and the
-    unit that depth is measured in, so nothing overflows and nothing depends on the scene's scale. A point that
-    touches the kernel but does not reach the centre blends in without making the silhouette grow; a pixel that
-    no point reaches stays empty.
+    Per pixel, `Σ b·e·v / Σ b·e` with the bilinear kernel b and `e = exp(−β |z/z_nearest − 1|)`,
+    where z_nearest is the least depth of the points that reach the pixel's centre: it is the
+    maximum that is subtracted and the unit that depth is measured in, so nothing overflows and
+    nothing depends on the scene's scale. A point that touches the kernel but does not reach the
+    centre blends in without making the silhouette grow; a pixel that no point reaches stays
+    empty.
 
-    On the CPU the same bits come out for any number of threads. The torch version agrees within rounding: it
-    adds in another order, on CUDA in no fixed one.
+    On the CPU the same bits come out for any number of threads. The torch version agrees within
+    rounding: it adds in another order, on CUDA in no fixed one.
     """
     in_torch = _needs_torch(points.u, points.depth, values)
     run = splat_pixels_torch if in_torch else splat_pixels_numba

@@ -15,7 +15,7 @@ def compiled(parallel: bool = False, contract: bool = False) -> Callable[[Callab
     """
     fastmath = {"contract"} if contract else False
 
-    def compile_kernel(kernel: Callable) -> Any:  # noqa: ANN401  a numba dispatcher has no type
+    def compile_kernel(kernel: Callable) -> Any:
         options = {"cache": True, "error_model": "numpy", "fastmath": fastmath}
         return numba.njit(parallel=parallel, **options)(inspect.unwrap(kernel))
 

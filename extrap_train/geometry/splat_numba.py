@@ -1,4 +1,5 @@
-"""Softmax splatting on the CPU: every thread owns a band of rows, so no atomics and the same bits on any count."""
+"""Softmax splatting on the CPU: every thread owns a band of rows, so no atomics and the same bits
+on any count."""
 
 import math
 
@@ -26,7 +27,8 @@ _POWERS = np.float32(2.0) ** -np.arange(90, dtype=np.float32)
 def splat_pixels_numba(
     points: ScreenPoints, values: Float[Tensor, "n c"], size: tuple[int, int, int]
 ) -> Float[Tensor, "b h w c1"]:
-    """Weighted sums of the values, and the summed weight as the last channel, for `size` = (b, h, w)."""
+    """Weighted sums of the values, and the summed weight as the last channel, for `size` = (b, h,
+    w)."""
     images, height, width = size
     starts = torch.searchsorted(points.image, torch.arange(images + 1))
     columns = (points.u, points.v, points.depth, points.reach_u, points.reach_v, values, starts)
@@ -37,7 +39,17 @@ def splat_pixels_numba(
 
 
 @compiled(parallel=True)
-def _splat(u, v, depth, reach_u, reach_v, values, starts, bands, summed):  # noqa: ANN001, ANN202
+def _splat(
+    u: np.ndarray,
+    v: np.ndarray,
+    depth: np.ndarray,
+    reach_u: np.ndarray,
+    reach_v: np.ndarray,
+    values: np.ndarray,
+    starts: np.ndarray,
+    bands: int,
+    summed: np.ndarray,
+) -> None:
     images, height, width, _ = summed.shape
     nearest = np.full((images, height, width), np.float32(np.inf), np.float32)
     for task in numba.prange(images * bands):
@@ -49,7 +61,16 @@ def _splat(u, v, depth, reach_u, reach_v, values, starts, bands, summed):  # noq
 
 
 @compiled()
-def _find_nearest(u, v, depth, reach_u, reach_v, span, rows, nearest):  # noqa: ANN001, ANN202
+def _find_nearest(
+    u: np.ndarray,
+    v: np.ndarray,
+    depth: np.ndarray,
+    reach_u: np.ndarray,
+    reach_v: np.ndarray,
+    span: tuple[int, int],
+    rows: tuple[int, int],
+    nearest: np.ndarray,
+) -> None:
     """Least depth of the points that reach each pixel's centre."""
     top, bottom = rows
     width = nearest.shape[1]
@@ -70,7 +91,16 @@ def _find_nearest(u, v, depth, reach_u, reach_v, span, rows, nearest):  # noqa: 
 
 
 @compiled(contract=True)
-def _add(u, v, depth, values, span, rows, nearest, summed):  # noqa: ANN001, ANN202
+def _add(
+    u: np.ndarray,
+    v: np.ndarray,
+    depth: np.ndarray,
+    values: np.ndarray,
+    span: tuple[int, int],
+    rows: tuple[int, int],
+    nearest: np.ndarray,
+    summed: np.ndarray,
+) -> None:
     """Add the points' values to the pixels around them, by kernel and depth."""
     top, bottom = rows
     width, channels = nearest.shape[1], values.shape[1]
@@ -106,8 +136,9 @@ def _add(u, v, depth, values, span, rows, nearest, summed):  # noqa: ANN001, ANN
 
 
 @compiled(contract=True)
-def _exp_minus(x):  # noqa: ANN001, ANN202
-    """exp(−x) for 0 ≤ x < 60 to 2·10⁻⁶: a power of two from a table times a polynomial on ±ln 2 / 2."""
+def _exp_minus(x: float) -> float:
+    """exp(−x) for 0 ≤ x < 60 to 2·10⁻⁶: a power of two from a table times a polynomial on ±ln 2 /
+    2."""
     whole = np.uint32(x * _PER_LN2 + _HALF)
     rest = np.float32(whole) * _LN2 - x
     series = _ONE + rest * (
@@ -117,14 +148,15 @@ def _exp_minus(x):  # noqa: ANN001, ANN202
 
 
 @compiled()
-def _touches(u, v, top, bottom, width):  # noqa: ANN001, ANN202
-    """Whether a point lies within a pixel of the rows and columns; also false for what is not a number."""
+def _touches(u: float, v: float, top: int, bottom: int, width: int) -> bool:
+    """Whether a point lies within a pixel of the rows and columns; also false for what is not a
+    number."""
     in_rows = np.float32(top) - _HALF <= v < np.float32(bottom) + _HALF
     return in_rows and -_HALF <= u < np.float32(width) + _HALF
 
 
 @compiled()
-def _split(position):  # noqa: ANN001, ANN202
+def _split(position: float) -> tuple[int, float]:
     """Whole and fractional part of a coordinate, counted from pixel centres."""
     shifted = position - _HALF
     whole = np.float32(math.floor(shifted))
@@ -143,7 +175,7 @@ def project_numba(
 
 
 @compiled(parallel=True)
-def _project(points, m, screen):  # noqa: ANN001, ANN202
+def _project(points: np.ndarray, m: np.ndarray, screen: np.ndarray) -> None:
     for i in numba.prange(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]

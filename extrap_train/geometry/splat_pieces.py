@@ -10,11 +10,14 @@ from extrap_train.geometry.splat_kernel import ScreenPoints
 from extrap_train.views import Camera
 
 LARGEST_SPACING = 1.05
-"""Query pixels between neighbouring points of a surface: every pixel centre then lies well inside a footprint."""
+"""Query pixels between neighbouring points of a surface: every pixel centre then lies well inside
+a footprint."""
 REACH_MARGIN = 0.03
-"""Query pixels by which neighbouring pieces of surface overlap, so that no seam shows what is behind."""
+"""Query pixels by which neighbouring pieces of surface overlap, so that no seam shows what is
+behind."""
 MOST_POINTS = 8
-"""Points per reference pixel along each axis: a surface stretched further is torn, it was hardly seen."""
+"""Points per reference pixel along each axis: a surface stretched further is torn, it was hardly
+seen."""
 
 
 @dataclass(frozen=True)

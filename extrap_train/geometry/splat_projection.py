@@ -7,11 +7,13 @@ from torch import Tensor
 from extrap_train.views import Camera
 
 LEAST_DEPTH_RATIO = 1e-3
-"""Points that much nearer to the query than to the reference are not drawn: they would fill the image."""
+"""Points that much nearer to the query than to the reference are not drawn: they would fill the
+image."""
 
 
 def reference_to_query_pixels(cameras: Camera, query: Camera) -> Float[Tensor, "b k 3 4"]:
-    """The matrix from (u, v, 1, 1/z) of a reference pixel to the query's homogeneous pixel times z/z_query."""
+    """The matrix from (u, v, 1, 1/z) of a reference pixel to the query's homogeneous pixel times
+    z/z_query."""
     reference_to_query = query.world_to_cam[:, None] @ cameras.cam_to_world
     turned = reference_to_query[..., :3, :3] @ torch.linalg.inv(cameras.intrinsics)
     moved = reference_to_query[..., :3, 3:]
@@ -24,7 +26,8 @@ def project_pixels(
     v: Float[Tensor, "*#b"],
     inverse: Float[Tensor, "*#b"],
 ) -> tuple[Float[Tensor, "*#b"], Float[Tensor, "*b"], Float[Tensor, "*b"]]:
-    """Query pixel and query depth as a multiple of the reference's; meaningless where that is ≤ 0."""
+    """Query pixel and query depth as a multiple of the reference's; meaningless where that is ≤
+    0."""
     x, y, ratio = (
         matrix[..., i, 0] * u
         + matrix[..., i, 1] * v

@@ -33,7 +33,8 @@ def sample_surfaces(
     cameras: Camera,
     query: Camera,
 ) -> Samples:
-    """Sample every reference pixel as finely as the query sees it, with its surface's slope and values."""
+    """Sample every reference pixel as finely as the query sees it, with its surface's slope and
+    values."""
     surface = surface_from_depth(depths, cameras)
     query_to_reference = cameras.world_to_cam @ query.cam_to_world[:, None]
     # n·x = 1 on the tangent plane; the query's centre must lie on the reference's side of it.

@@ -1,4 +1,5 @@
-"""`splat_samples` and `splat_unseen` on the CPU: the same arithmetic, pixel by pixel, in compiled loops."""
+"""`splat_samples` and `splat_unseen` on the CPU: the same arithmetic, pixel by pixel, in compiled
+loops."""
 
 import math
 
@@ -14,7 +15,8 @@ from extrap_train.geometry.splat_kernel import OUTSIDE, ScreenPoints
 from extrap_train.geometry.splat_pieces import Pieces, Samples
 from extrap_train.geometry.splat_projection import LEAST_DEPTH_RATIO
 
-# Single precision throughout, in the same order of operations as in torch: the same points come out.
+# Single precision throughout, in the same order of operations as in torch: the same points come
+# out.
 _ONE, _HALF, _TWO, _ZERO = (np.float32(x) for x in (1, 0.5, 2, 0))
 _LARGEST_SPACING = np.float32(splat_pieces.LARGEST_SPACING)
 _REACH_MARGIN = np.float32(splat_pieces.REACH_MARGIN)
@@ -29,7 +31,8 @@ _NOWHERE = np.float32(OUTSIDE)
 
 
 def sample_pieces_numba(pieces: Pieces, maps: Float[Tensor, "b k c h w"]) -> Samples:
-    """The same points as torch makes; those that fall outside stay in, at a place outside the image."""
+    """The same points as torch makes; those that fall outside stay in, at a place outside the
+    image."""
     surface, query = pieces.surface, pieces.query
     b, k, c, h, w = maps.shape
     inverse, drawn, valid = (
@@ -49,11 +52,13 @@ def sample_pieces_numba(pieces: Pieces, maps: Float[Tensor, "b k c h w"]) -> Sam
     _fill(inverse, drawn, slopes, connected, matrix, planes, unseen, stops, points, values)
     per_image = torch.from_numpy(np.diff(stops[k * h - 1 :: k * h], prepend=0))
     image = torch.repeat_interleave(torch.arange(b), per_image)
-    return Samples(ScreenPoints(*torch.from_numpy(points), image), torch.from_numpy(values))
+    u, v, depth, reach_u, reach_v = torch.from_numpy(points)
+    screen = ScreenPoints(u, v, depth, reach_u, reach_v, image)
+    return Samples(screen, torch.from_numpy(values))
 
 
 @compiled()
-def _project(m, u, v, inverse):  # noqa: ANN001, ANN202
+def _project(m: np.ndarray, u: float, v: float, inverse: float) -> tuple[float, float, float]:
     x = m[0, 0] * u + m[0, 1] * v + m[0, 2] + m[0, 3] * inverse
     y = m[1, 0] * u + m[1, 1] * v + m[1, 2] + m[1, 3] * inverse
     ratio = m[2, 0] * u + m[2, 1] * v + m[2, 2] + m[2, 3] * inverse
@@ -62,8 +67,11 @@ def _project(m, u, v, inverse):  # noqa: ANN001, ANN202
 
 
 @compiled()
-def _step(m, u, v, ratio, axis, slope):  # noqa: ANN001, ANN202
-    """Movement in the query for one reference pixel along an axis, and how many points that takes."""
+def _step(
+    m: np.ndarray, u: float, v: float, ratio: float, axis: int, slope: float
+) -> tuple[float, float, int]:
+    """Movement in the query for one reference pixel along an axis, and how many points that
+    takes."""
     z = m[2, axis] + slope * m[2, 3]
     across = (m[0, axis] + slope * m[0, 3] - u * z) / max(ratio, _LEAST_RATIO)
     down = (m[1, axis] + slope * m[1, 3] - v * z) / max(ratio, _LEAST_RATIO)
@@ -74,7 +82,9 @@ def _step(m, u, v, ratio, axis, slope):  # noqa: ANN001, ANN202
 
 
 @compiled()
-def _steps(m, inverse, slopes, y, x):  # noqa: ANN001, ANN202
+def _steps(
+    m: np.ndarray, inverse: np.ndarray, slopes: np.ndarray, y: int, x: int
+) -> tuple[tuple[float, float, int], tuple[float, float, int]]:
     u, v, ratio = _project(m, np.float32(x) + _HALF, np.float32(y) + _HALF, inverse[y, x])
     along_u = _step(m, u, v, ratio, 0, (slopes[0, y, x] + slopes[1, y, x]) / _TWO)
     along_v = _step(m, u, v, ratio, 1, (slopes[2, y, x] + slopes[3, y, x]) / _TWO)
@@ -82,7 +92,9 @@ def _steps(m, inverse, slopes, y, x):  # noqa: ANN001, ANN202
 
 
 @compiled(parallel=True)
-def _count(inverse, drawn, slopes, matrix):  # noqa: ANN001, ANN202
+def _count(
+    inverse: np.ndarray, drawn: np.ndarray, slopes: np.ndarray, matrix: np.ndarray
+) -> np.ndarray:
     """Points in each row of each reference."""
     references, height, _ = inverse.shape
     counts = np.zeros(references * height, np.int64)
@@ -93,7 +105,9 @@ def _count(inverse, drawn, slopes, matrix):  # noqa: ANN001, ANN202
 
 
 @compiled()
-def _count_row(inverse, drawn, slopes, m, y):  # noqa: ANN001, ANN202
+def _count_row(
+    inverse: np.ndarray, drawn: np.ndarray, slopes: np.ndarray, m: np.ndarray, y: int
+) -> int:
     count = 0
     for x in range(inverse.shape[1]):
         if drawn[y, x]:
@@ -103,7 +117,18 @@ def _count_row(inverse, drawn, slopes, m, y):  # noqa: ANN001, ANN202
 
 
 @compiled(parallel=True)
-def _fill(inverse, drawn, slopes, connected, matrix, maps, unseen, stops, points, values):  # noqa: ANN001, ANN202
+def _fill(
+    inverse: np.ndarray,
+    drawn: np.ndarray,
+    slopes: np.ndarray,
+    connected: np.ndarray,
+    matrix: np.ndarray,
+    maps: np.ndarray,
+    unseen: np.ndarray,
+    stops: np.ndarray,
+    points: np.ndarray,
+    values: np.ndarray,
+) -> None:
     references, height, _ = inverse.shape
     for task in numba.prange(references * height):
         r, y = task // height, task % height
@@ -113,7 +138,16 @@ def _fill(inverse, drawn, slopes, connected, matrix, maps, unseen, stops, points
 
 
 @compiled()
-def _fill_row(surface, m, maps, unseen, y, n, points, values):  # noqa: ANN001, ANN202
+def _fill_row(
+    surface: tuple[np.ndarray, ...],
+    m: np.ndarray,
+    maps: np.ndarray,
+    unseen: np.ndarray,
+    y: int,
+    n: int,
+    points: np.ndarray,
+    values: np.ndarray,
+) -> None:
     inverse, drawn, slopes, connected = surface
     for x in range(inverse.shape[1]):
         if not drawn[y, x]:
@@ -143,7 +177,7 @@ def _fill_row(surface, m, maps, unseen, y, n, points, values):  # noqa: ANN001, 
 
 
 @compiled()
-def _seen(u, v, ratio, inverse, unseen):  # noqa: ANN001, ANN202
+def _seen(u: float, v: float, ratio: float, inverse: float, unseen: np.ndarray) -> bool:
     height, width = unseen.shape
     inside = -_HALF < u < np.float32(width) + _HALF and -_HALF < v < np.float32(height) + _HALF
     if not (inside and inverse > _ZERO and ratio > _LEAST_RATIO):
@@ -153,7 +187,15 @@ def _seen(u, v, ratio, inverse, unseen):  # noqa: ANN001, ANN202
 
 
 @compiled(parallel=True)
-def _draw_walls(inverse, valid, connected, ends, intrinsics, matrix, unseen):  # noqa: ANN001, ANN202
+def _draw_walls(
+    inverse: np.ndarray,
+    valid: np.ndarray,
+    connected: np.ndarray,
+    ends: np.ndarray,
+    intrinsics: np.ndarray,
+    matrix: np.ndarray,
+    unseen: np.ndarray,
+) -> None:
     """Depth buffer of the walls behind occluding edges (`splat_unseen`)."""
     for r in numba.prange(len(inverse)):
         for side in range(4):
@@ -163,7 +205,9 @@ def _draw_walls(inverse, valid, connected, ends, intrinsics, matrix, unseen):  #
 
 
 @compiled()
-def _draw_walls_of_side(surface, side, focal, m, unseen):  # noqa: ANN001, ANN202
+def _draw_walls_of_side(
+    surface: tuple[np.ndarray, ...], side: int, focal: float, m: np.ndarray, unseen: np.ndarray
+) -> None:
     inverse, valid, connected, ends = surface
     du = (2 * side - 1) if side < 2 else 0
     dv = (2 * side - 5) if side >= 2 else 0
@@ -181,7 +225,7 @@ def _draw_walls_of_side(surface, side, focal, m, unseen):  # noqa: ANN001, ANN20
 
 
 @compiled()
-def _run(connected, y, x, dy, dx):  # noqa: ANN001, ANN202
+def _run(connected: np.ndarray, y: int, x: int, dy: int, dx: int) -> int:
     """Pixels connected in a row from (y, x) on, itself included."""
     count = 1
     while connected[y, x]:
@@ -190,7 +234,9 @@ def _run(connected, y, x, dy, dx):  # noqa: ANN001, ANN202
 
 
 @compiled()
-def _draw_wall(m, u, v, start, stop, upright, unseen):  # noqa: ANN001, ANN202
+def _draw_wall(
+    m: np.ndarray, u: float, v: float, start: float, stop: float, upright: bool, unseen: np.ndarray
+) -> None:
     height, width = unseen.shape
     x0, y0, _ = _project(m, u, v, start)
     x1, y1, _ = _project(m, u, v, stop)

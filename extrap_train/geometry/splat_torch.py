@@ -10,7 +10,8 @@ from extrap_train.geometry.splat_kernel import DEPTH_SHARPNESS, ScreenPoints
 def splat_pixels_torch(
     points: ScreenPoints, values: Float[Tensor, "n c"], size: tuple[int, int, int]
 ) -> Float[Tensor, "b h w c1"]:
-    """Weighted sums of the values, and the summed weight as the last channel, for `size` = (b, h, w)."""
+    """Weighted sums of the values, and the summed weight as the last channel, for `size` = (b, h,
+    w)."""
     pixel, point, kernel, reached = _footprints(points, size)
     b, h, w = size
     z = points.depth[point]
@@ -27,7 +28,8 @@ def splat_pixels_torch(
 def _footprints(
     points: ScreenPoints, size: tuple[int, int, int]
 ) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"], Float[Tensor, "m"], Bool[Tensor, "m"]]:
-    """Pairs of a pixel (flat index) and a point near it, their kernel, and whether the point reaches its centre."""
+    """Pairs of a pixel (flat index) and a point near it, their kernel, and whether the point
+    reaches its centre."""
     _, h, w = size
     column, row = torch.floor(points.u - 0.5), torch.floor(points.v - 0.5)
     right, down = points.u - 0.5 - column, points.v - 0.5 - row

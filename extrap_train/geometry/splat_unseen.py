@@ -1,8 +1,9 @@
 """What a reference cannot know: the space behind the edges of what it sees.
 
-Seen from the side, a solid object has a flank that the reference never saw, and what lies behind it shines
-through. So a wall is drawn from each occluding edge backwards along the reference's ray. How deep the object is
-nobody knows: `DEPTH_PER_WIDTH` is what an apple and a box both get along with.
+Seen from the side, a solid object has a flank that the reference never saw, and what lies behind
+it shines through. So a wall is drawn from each occluding edge backwards along the reference's
+ray. How deep the object is nobody knows: `DEPTH_PER_WIDTH` is what an apple and a box both get
+along with.
 """
 
 import torch
@@ -19,8 +20,9 @@ from extrap_train.geometry.splat_projection import (
 from extrap_train.views import Camera
 
 DEPTH_PER_WIDTH = 0.35
-"""Depth of the unseen part of an object as a share of its width: seen 45° from the side, the flank of a cube stays
-closed and little of the surroundings is lost. The surface behind ends it in any case."""
+"""Depth of the unseen part of an object as a share of its width: seen 45° from the side, the
+flank of a cube stays closed and little of the surroundings is lost. The surface behind ends it in
+any case."""
 SPACING = 0.7
 """Query pixels between points of a wall, of which each fills the one pixel that it falls in."""
 TOLERANCE = 0.01
@@ -38,7 +40,8 @@ def hidden_by_unseen(
     query: Camera,
     points: ScreenPoints,
 ) -> Bool[Tensor, "n"]:
-    """Which points lie behind space that their reference never saw; here `image` counts the b·k references."""
+    """Which points lie behind space that their reference never saw; here `image` counts the b·k
+    references."""
     column = points.u.long().clamp(0, query.width - 1)
     row = points.v.long().clamp(0, query.height - 1)
     limit = depth_of_unseen(surface, matrix, cameras, query).flatten(0, 1)[
@@ -50,7 +53,8 @@ def hidden_by_unseen(
 def depth_of_unseen(
     surface: Surface, matrix: Float[Tensor, "b k 3 4"], cameras: Camera, query: Camera
 ) -> Float[Tensor, "b k h2 w2"]:
-    """Per reference, the query depth where unseen space begins; infinite where the reference knows no better."""
+    """Per reference, the query depth where unseen space begins; infinite where the reference
+    knows no better."""
     b, k = matrix.shape[:2]
     empty = torch.full((b * k * query.height * query.width,), torch.inf, device=matrix.device)
     image, side, v, u, start, stop = _walls(surface, cameras)
@@ -76,7 +80,8 @@ def depth_of_unseen(
 
 
 def _walls(surface: Surface, cameras: Camera) -> tuple[Tensor, ...]:
-    """Image, side, v, u of each occluding edge, and the inverse depths at which its wall starts and stops."""
+    """Image, side, v, u of each occluding edge, and the inverse depths at which its wall starts
+    and stops."""
     h, w = surface.inverse_depth.shape[-2:]
     inverse = surface.inverse_depth.detach().reshape(-1, h, w)
     ends = (surface.ends & surface.valid[..., None, :, :]).reshape(-1, 4, h, w)

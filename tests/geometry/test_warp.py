@@ -124,11 +124,11 @@ def test_torch_and_numba_agree():
 
 
 def test_gradients():
-    images, depths, cameras = references(scenes.SPHERE, [0, 30], size=8)
+    images, depths, cameras = references(scenes.PLANE, [0, 30], size=8)
     cameras = replace(
         cameras, world_to_cam=cameras.world_to_cam.double(), intrinsics=cameras.intrinsics.double()
     )
-    query = scenes.orbit_camera(17, size=8)
+    query = scenes.orbit_camera(17, elevation_deg=23, size=8)
     query = replace(
         query, world_to_cam=query.world_to_cam.double(), intrinsics=query.intrinsics.double()
     )
