@@ -58,8 +58,13 @@ def surface_from_depth(depth: Float[Tensor, "*b h w"], camera: Camera) -> Surfac
     connected = [*across.connected, *(link.mT for link in down.connected)]
     on_surface = (connected[0] | connected[1]) & (connected[2] | connected[3])
     ends = [*across.ends, *(end.mT for end in down.ends)]
-    valid = known & on_surface & ~across.behind & ~down.behind.mT
-    return Surface(inverse, *(torch.stack(sides, -3) for sides in (slopes, connected, ends)), valid)
+    return Surface(
+        inverse_depth=inverse,
+        slopes=torch.stack(slopes, -3),
+        connected=torch.stack(connected, -3),
+        ends=torch.stack(ends, -3),
+        valid=known & on_surface & ~across.behind & ~down.behind.mT,
+    )
 
 
 def normals_from_depth(

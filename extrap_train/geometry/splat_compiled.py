@@ -10,13 +10,17 @@ import numba
 def compiled(parallel: bool = False, contract: bool = False) -> Callable[[Callable], Any]:
     """Compile a kernel and keep the machine code on disk.
 
-    `contract` fuses multiplications with additions, for sums that no decision hangs on: elsewhere the same
-    rounding as in torch is wanted. Type checkers that wrap every function are looked through.
+    `contract` fuses multiplications with additions, for sums that no decision hangs on: elsewhere
+    the same rounding as in torch is wanted. Shape checkers that wrap every function are looked
+    through.
     """
-    fastmath = {"contract"} if contract else False
 
     def compile_kernel(kernel: Callable) -> Any:
-        options = {"cache": True, "error_model": "numpy", "fastmath": fastmath}
-        return numba.njit(parallel=parallel, **options)(inspect.unwrap(kernel))
+        return numba.njit(
+            cache=True,
+            error_model="numpy",
+            parallel=parallel,
+            fastmath={"contract"} if contract else False,
+        )(inspect.unwrap(kernel))
 
     return compile_kernel

@@ -127,12 +127,17 @@ def _add(
                     continue
                 kernel_x = right if dx else _ONE - right
                 weight = kernel_x * kernel_y * _exp_minus(exponent)
-                if channels + 1 == _USUAL_LANES:  # known when compiled: one vector instruction
-                    for c in range(_USUAL_LANES):
-                        summed[row, column, c] += weight * lanes[c]
-                else:
-                    for c in range(channels + 1):
-                        summed[row, column, c] += weight * lanes[c]
+                _add_lanes(summed, row, column, lanes, weight)
+
+
+@compiled(contract=True)
+def _add_lanes(summed: np.ndarray, row: int, column: int, lanes: np.ndarray, weight: float) -> None:
+    if len(lanes) == _USUAL_LANES:  # known when compiled: one vector instruction
+        for c in range(_USUAL_LANES):
+            summed[row, column, c] += weight * lanes[c]
+    else:
+        for c in range(len(lanes)):
+            summed[row, column, c] += weight * lanes[c]
 
 
 @compiled(contract=True)
@@ -149,14 +154,13 @@ def _exp_minus(x: float) -> float:
 
 @compiled()
 def _touches(u: float, v: float, top: int, bottom: int, width: int) -> bool:
-    """Whether a point lies within a pixel of the rows and columns; also false for what is not a
-    number."""
+    """Whether a point lies within a pixel of the rows and columns; false for NaN, too."""
     in_rows = np.float32(top) - _HALF <= v < np.float32(bottom) + _HALF
-    return in_rows and -_HALF <= u < np.float32(width) + _HALF
+    return bool(in_rows and -_HALF <= u < np.float32(width) + _HALF)
 
 
 @compiled()
-def _split(position: float) -> tuple[int, float]:
+def _split(position: float) -> tuple[np.int32, np.floating]:
     """Whole and fractional part of a coordinate, counted from pixel centres."""
     shifted = position - _HALF
     whole = np.float32(math.floor(shifted))

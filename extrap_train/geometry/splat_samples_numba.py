@@ -78,7 +78,7 @@ def _step(
     count = min(
         np.float32(math.sqrt(across * across + down * down)) / _LARGEST_SPACING, _MOST_POINTS
     )
-    return abs(across), abs(down), max(int(math.ceil(count)), 1)
+    return abs(across), abs(down), max(math.ceil(count), 1)
 
 
 @compiled()
@@ -241,7 +241,7 @@ def _draw_wall(
     x0, y0, _ = _project(m, u, v, start)
     x1, y1, _ = _project(m, u, v, stop)
     length = np.float32(math.sqrt((x1 - x0) * (x1 - x0) + (y1 - y0) * (y1 - y0)))
-    count = int(math.ceil(min(max(length / _WALL_SPACING, _ONE), _WALL_MOST)))
+    count = math.ceil(min(max(length / _WALL_SPACING, _ONE), _WALL_MOST))
     for i in range(count):
         along = (np.float32(i) + _HALF) / np.float32(count) - _HALF + _HALF
         inverse = start + (stop - start) * along

@@ -16,9 +16,11 @@ def splat_pixels_torch(
     b, h, w = size
     z = points.depth[point]
     nearest = torch.full((b * h * w,), torch.inf, device=z.device, dtype=z.dtype)
-    claim = torch.where(reached, z.detach(), torch.inf)
+    claim = torch.where(reached, z, torch.inf)
     nearest = nearest.scatter_reduce(0, pixel, claim, "amin")[pixel]
-    away = torch.where(torch.isfinite(nearest), (z - nearest).abs() / nearest, torch.inf)
+    claimed = torch.isfinite(nearest)
+    unit = torch.where(claimed, nearest, 1)
+    away = torch.where(claimed, (z - unit).abs() / unit, torch.inf)
     weight = kernel * torch.exp(-DEPTH_SHARPNESS * away)
     rows = torch.cat([values[point] * weight[:, None], weight[:, None]], 1)
     summed = torch.zeros(b * h * w, rows.shape[1], device=rows.device, dtype=rows.dtype)

@@ -22,8 +22,8 @@ def warp_references(
 ) -> Warp:
     """Fuse all references of each query view in one depth-aware splat; reference 0 is the nearest.
 
-    `cameras` is batched `b k` and `query` `b`; the query's image size may differ from the references'. Depth 0
-    (or not finite) is unknown, and `valid` False leaves a reference out.
+    `cameras` is batched `b k` and `query` `b`; the query's image size may differ from the
+    references'. Depth 0 (or not finite) is unknown, and `valid` False leaves a reference out.
     """
     b, k, _, h, w = images.shape
     depths = torch.where(valid[..., None, None], depths, 0)
