@@ -1,4 +1,4 @@
-"""Depth behind one protocol: pairwise point maps with confidence, as a pairwise 3D model gives them.
+"""Depth behind one protocol: pairwise point maps with confidence, as a pairwise 3D model has them.
 
 A source is added with one file here and one YAML under `conf/depth/`.
 """
@@ -15,12 +15,12 @@ from extrap_train.geometry.cameras import transform, unproject
 from extrap_train.views import View
 
 RELIABLE_CONFIDENCE = 0.3
-"""From here on a depth is used: most of what lies below is wrong, most of what lies above is right."""
+"""From here on a depth is to be used: about half of what lies below is wrong, little above."""
 
 
 @dataclass(frozen=True)
 class PointMaps:
-    """A point per pixel for each of two views, both in the *first* camera's frame and in scene units."""
+    """A point per pixel for each of two views, both in the *first* camera's frame; scene units."""
 
     first: Float[Tensor, "h w 3"]
     second: Float[Tensor, "h2 w2 3"]

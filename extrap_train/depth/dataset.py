@@ -37,6 +37,7 @@ class DatasetDepth:
 def _depth(view: View) -> Float[Tensor, "h w"]:
     if view.depth is None:
         raise InputError(
-            f"{view.name or 'a view'}: has no depth; use depth=stereo, which estimates it from the photographs"
+            f"{view.name or 'a view'}: has no depth; use depth=stereo, which estimates it from "
+            "the photographs"
         )
     return view.depth

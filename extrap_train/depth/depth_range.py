@@ -4,20 +4,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrap_train.depth.photo_cost import Projection
+from extrap_train.depth.photo_cost import projection_between
 from extrap_train.views import Camera
 
 NEAREST, FARTHEST = 0.3, 20.0
 """Range of depths, as multiples of the scene centre's depth."""
 WIDEST_DISPARITY = 0.25
-"""Of cameras that look the same way: the largest displacement, as a share of the image's longer side."""
+"""Of cameras that look the same way: largest displacement, as a share of the longer side."""
 LEAST_SEEN = 0.1
-"""A depth at which fewer of a view's pixels are seen by a neighbour cannot be told, and is not tried."""
+"""A depth is not tried if a smaller share of the pixels is then seen by any neighbour."""
 LEAST_CONVERGENCE_RAD = 0.05
+"""Optical axes that differ by less have no nearest point worth the name."""
 
 
 def scene_center(cameras: list[Camera]) -> Float[Tensor, "3"] | None:
-    """The point nearest to all optical axes, by least squares; None if the cameras look the same way."""
+    """The least-squares nearest point to all optical axes; None if they are nearly parallel."""
     centers = torch.stack([camera.center for camera in cameras]).double()
     axes = torch.stack([camera.forward for camera in cameras]).double()
     if float(torch.acos((axes @ axes.mT).clamp(-1, 1)).max()) < LEAST_CONVERGENCE_RAD:
@@ -32,8 +33,9 @@ def inverse_depth_range(
 ) -> tuple[float, float]:
     """Least and greatest inverse depth that a pixel of `camera` may have, in 1 / scene unit.
 
-    Around the scene's centre; for cameras that look the same way, or away from it, from infinity to where
-    the displacement between the images becomes too large. Depths that no neighbour sees are cut off.
+    Around the scene's centre; for cameras that look the same way, or away from it, from infinity
+    to where the displacement between the images becomes too large. Depths that no neighbour sees
+    are cut off.
     """
     center_depth = 0.0
     if center is not None:
@@ -53,7 +55,7 @@ def _seen(
 ) -> tuple[float, float]:
     small = camera.resized(16, 16)
     inverse_depth = candidates.to(camera.intrinsics)[:, None, None].expand(-1, 16, 16)
-    seen = [Projection.between(small, other).normalised(inverse_depth)[1] for other in neighbours]
+    seen = [projection_between(small, other).normalised(inverse_depth)[1] for other in neighbours]
     share = torch.stack(seen).any(0).float().mean((-2, -1))
     used = candidates[share.cpu() >= LEAST_SEEN]
     if not len(used):

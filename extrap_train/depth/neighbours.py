@@ -9,10 +9,10 @@ from torch import Tensor
 
 from extrap_train.views import Camera
 
-NEAREST_RAD, FARTHEST_RAD = math.radians(6), math.radians(25)
+NEAREST_RAD, FARTHEST_RAD = math.radians(6), math.radians(18)
 """Seen from the scene's centre: nearer and depth is vague, farther and surfaces look different."""
-LIMIT_RAD = math.radians(45)
-"""Farther ones never help."""
+LEAST_RAD, LIMIT_RAD = math.radians(3), math.radians(45)
+"""Outside, views never help: those of the same place agree at any depth."""
 
 
 def choose_neighbours(
@@ -20,26 +20,28 @@ def choose_neighbours(
 ) -> list[list[int]]:
     """For every camera the indices of up to `count` others, by turns from its left and its right.
 
-    Angles are those at `center`; without one (cameras that look the same way) the nearest cameras are taken.
+    Angles are those at `center`; without one (cameras that look the same way) the nearest cameras
+    are taken.
     """
     positions = torch.stack([camera.center for camera in cameras])
     rights = torch.stack([camera.world_to_cam[0, :3] for camera in cameras])
     on_right = ((positions[None] - positions[:, None]) * rights[:, None]).sum(-1) > 0
     if center is None:
         badness = torch.cdist(positions, positions)
-        badness.fill_diagonal_(torch.inf)
+        badness = torch.where(badness > 0, badness, torch.inf)
     else:
         badness = _badness(positions - center)
     return [_by_turns(badness[i], on_right[i], count) for i in range(len(cameras))]
 
 
 def _badness(offsets: Float[Tensor, "n 3"]) -> Float[Tensor, "n n"]:
-    """How far an angle is from the useful range, then from its middle; infinite beyond the limit."""
+    """How far an angle is from the useful range, then from its middle; infinite if useless."""
     directions = offsets / offsets.norm(dim=-1, keepdim=True)
     angle_rad = torch.acos((directions @ directions.mT).clamp(-1, 1)).fill_diagonal_(torch.inf)
     outside = (NEAREST_RAD - angle_rad).clamp_min(0) + (angle_rad - FARTHEST_RAD).clamp_min(0)
+    useful = (angle_rad >= LEAST_RAD) & (angle_rad <= LIMIT_RAD)
     middle = (angle_rad - (NEAREST_RAD + FARTHEST_RAD) / 2).abs()
-    return torch.where(angle_rad <= LIMIT_RAD, 10 * outside + middle, torch.inf)
+    return torch.where(useful, 10 * outside + middle, torch.inf)
 
 
 def _by_turns(badness: Float[Tensor, "n"], on_right: Tensor, count: int) -> list[int]:

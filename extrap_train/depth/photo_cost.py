@@ -1,7 +1,6 @@
 """How alike views look at hypothetical depths: the matching cost of plane-sweep stereo."""
 
 from dataclasses import dataclass
-from typing import Self
 
 import torch
 from jaxtyping import Bool, Float
@@ -13,8 +12,8 @@ from extrap_train.views import Camera, View
 
 WINDOW = 5
 """Side of the window that is compared, in pixels."""
-NOISE_VARIANCE = 2e-5
-"""Variance of colour that counts as noise: a window with no more than that looks like any other."""
+NOISE_VARIANCE = 5e-6
+"""Variance of a colour channel (0.6/255 squared) that counts as noise, not as texture."""
 CHUNK_ELEMENTS = 4_000_000
 """Most colour samples that are held at a time."""
 
@@ -30,21 +29,6 @@ class Projection:
     epipole: Float[Tensor, "3"]
     height: int
     width: int
-
-    @classmethod
-    def between(
-        cls, source: Camera, target: Camera, pixels: Float[Tensor, "h w 2"] | None = None
-    ) -> Self:
-        """From `pixels` of `source`, by default its pixel centres, to pixels of `target`."""
-        source_to_target = target.world_to_cam @ source.cam_to_world
-        homography = (
-            target.intrinsics @ source_to_target[:3, :3] @ torch.linalg.inv(source.intrinsics)
-        )
-        if pixels is None:
-            pixels = pixel_grid(source.height, source.width, homography.device)
-        epipole = target.intrinsics @ source_to_target[:3, 3]
-        homogeneous = functional.pad(pixels, (0, 1), value=1.0)
-        return cls(homogeneous @ homography.mT, epipole, target.height, target.width)
 
     def points(
         self, inverse_depth: Float[Tensor, "*d h w"]
@@ -64,17 +48,31 @@ class Projection:
         return pixels / size * 2 - 1, inside
 
 
+def projection_between(
+    source: Camera, target: Camera, pixels: Float[Tensor, "h w 2"] | None = None
+) -> Projection:
+    """From `pixels` of `source`, by default its pixel centres, to pixels of `target`."""
+    source_to_target = target.world_to_cam @ source.cam_to_world
+    homography = target.intrinsics @ source_to_target[:3, :3] @ torch.linalg.inv(source.intrinsics)
+    if pixels is None:
+        pixels = pixel_grid(source.height, source.width, homography.device)
+    homogeneous = functional.pad(pixels, (0, 1), value=1.0)
+    epipole = target.intrinsics @ source_to_target[:3, 3]
+    return Projection(homogeneous @ homography.mT, epipole, target.height, target.width)
+
+
 class PhotoCost:
     """Cost of depth hypotheses of one view against its neighbours.
 
-    1 − zero-mean normalised cross-correlation of colour windows (which exposure does not change), halved
-    to [0, 1], averaged over the better half of the neighbours that see the point: an occluded one disagrees.
+    1 − zero-mean normalised cross-correlation of colour windows (which exposure does not change),
+    halved to [0, 1], and averaged over the better half of the neighbours: those that do not see
+    the point disagree.
     """
 
     def __init__(self, view: View, neighbours: list[View]) -> None:
         self.image = view.image
         self.neighbours = [
-            (Projection.between(view.camera, other.camera), other.image) for other in neighbours
+            (projection_between(view.camera, other.camera), other.image) for other in neighbours
         ]
         self.mean = _box(self.image[None])
         self.variance = _variance(self.image[None], self.mean)

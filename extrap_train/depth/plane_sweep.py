@@ -8,12 +8,12 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from extrap_train.depth.photo_cost import PhotoCost, Projection
+from extrap_train.depth.photo_cost import PhotoCost, projection_between
 from extrap_train.depth.semi_global import semi_global_cost
 from extrap_train.views import View
 
-COARSEST_STEP = 1.2
-"""Largest displacement between two planes in a neighbour, in pixels; the sweep's image is as small as that asks."""
+COARSEST_STEP = 2.0
+"""Most pixels between two planes in a neighbour: the sweep's image is as small as that asks."""
 SMALLEST_SIDE = 64
 """The sweep's image keeps at least this many pixels on its longer side."""
 REFINEMENT_STEPS = 3
@@ -58,7 +58,7 @@ def _refined(
     start = _median(functional.interpolate(start[None, None], size, mode="nearest-exact")[0, 0])
     offsets = step * torch.arange(-REFINEMENT_STEPS, REFINEMENT_STEPS + 1, device=start.device)
     cost = PhotoCost(view, neighbours)((start + offsets[:, None, None]).clamp(*bounds))
-    index, least = _best_index(_smooth(cost, view.image))
+    index, least = _best_index(cost)
     found = start + step * (index - REFINEMENT_STEPS)
     return Estimate(found.clamp(*bounds), (1 - 2 * least).clamp(0, 1))
 
@@ -66,17 +66,13 @@ def _refined(
 def _best_index(
     cost: Float[Tensor, "d h w"],
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """Index of the least cost, refined by a parabola through it and its neighbours; and that cost."""
+    """Index of the least cost, by a parabola through it and its neighbours; and that cost."""
     least, best = cost.min(0)
     inner = best.clamp(1, len(cost) - 2)[None]
     before, middle, after = (cost.gather(0, inner + i)[0] for i in (-1, 0, 1))
     curvature = (before - 2 * middle + after).clamp_min(1e-6)
     shift = ((before - after) / (2 * curvature)).clamp(-0.5, 0.5)
     return torch.where(best == inner[0], best + shift, best.to(cost.dtype)), least
-
-
-def _smooth(cost: Float[Tensor, "d h w"], image: Float[Tensor, "3 h w"]) -> Float[Tensor, "d h w"]:
-    return cost
 
 
 def _median(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
@@ -110,7 +106,7 @@ def _plane_spacing(
     middle = torch.full((8, 8), sum(bounds) / 2, device=view.image.device)
     spacings = []
     for other in neighbours:
-        projection = Projection.between(camera, other.camera)
+        projection = projection_between(camera, other.camera)
         moved = projection.points(middle + step)[0] - projection.points(middle)[0]
         spacings.append(moved.norm(dim=-1).median())
     return float(torch.stack(spacings).median())

@@ -1,4 +1,5 @@
-"""Semi-global matching (Hirschmüller, Stereo Processing by Semiglobal Matching, 2008), vectorised over scanlines."""
+"""Semi-global matching (Hirschmüller, Stereo Processing by Semiglobal Matching and Mutual
+Information, 2008), vectorised over scanlines."""
 
 import torch
 from jaxtyping import Float
@@ -7,7 +8,7 @@ from torch.nn import functional
 
 SMALL_STEP = 0.03
 """Penalty of a change by one hypothesis between neighbouring pixels (cost is in [0, 1])."""
-JUMP = 0.3
+JUMP = 0.6
 """Penalty of a larger change within one colour; it falls where colour changes."""
 EDGE_CONTRAST = 0.05
 """Colour difference that halves the penalty of a jump."""
@@ -16,10 +17,10 @@ EDGE_CONTRAST = 0.05
 def semi_global_cost(
     cost: Float[Tensor, "d h w"], image: Float[Tensor, "3 h w"]
 ) -> Float[Tensor, "d h w"]:
-    """Mean over eight path directions of the least cost of a path of hypotheses that ends in each pixel."""
+    """Least cost of a path of hypotheses that ends in each pixel, mean of eight directions."""
     rows = cost.permute(1, 2, 0)
     columns, image_columns = cost.permute(2, 1, 0), image.mT
-    down = sum(_both_ways(rows, image, shift) for shift in (-1, 0, 1))
+    down = torch.stack([_both_ways(rows, image, shift) for shift in (-1, 0, 1)]).sum(0)
     across = _both_ways(columns, image_columns, 0)
     return (down.permute(2, 0, 1) + across.permute(2, 1, 0)) / 8
 

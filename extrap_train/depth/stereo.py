@@ -18,16 +18,17 @@ from extrap_train.errors import InputError
 from extrap_train.views import View
 
 SAME_SURFACE = 0.02
-"""Relative difference of depth below which neighbouring pixels are interpolated when a map is enlarged."""
+"""Relative difference of depth below which an enlarged map is interpolated."""
 
 
 @dataclass(frozen=True)
 class PlaneSweepStereo:
     """Depth wherever two views see the same textured surface.
 
-    Confidence is the correlation of the windows (0 to 1) times how well the neighbours' depths agree; it is 0
-    where they contradict the estimate, no neighbour sees the pixel, or there is no texture. Depth is kept
-    there too: `DepthMap.reliable` says what to use. The scene must not move.
+    Confidence is the correlation of the windows (0 to 1) times how well the neighbours' depths
+    agree; it is 0 where they contradict the estimate, no neighbour sees the pixel, or there is no
+    texture. Depth is kept there too: `DepthMap.reliable` says what to use. Nothing in the scene
+    may move between the photographs.
     """
 
     config: StereoConfig
@@ -38,33 +39,39 @@ class PlaneSweepStereo:
         return self.config.image_size
 
     def depth_map(self, view: View, neighbours: Sequence[View]) -> DepthMap:
-        """One view's depth; the neighbours' are computed too, for the consistency check."""
+        """One view's depth; the neighbours' are computed too, for the consistency check.
+
+        InputError if no neighbour sees the scene from a useful angle.
+        """
         views = [view, *neighbours]
-        helpers = self._helpers(views)
+        helpers = self.neighbours(views)
+        _require_helpers(view, helpers[0])
         for other in range(1, len(views)):
             rest = [i for i in helpers[other] if i != 0]
             helpers[other] = [0, *rest][: self.config.neighbours]
         return self._maps(views, helpers, wanted=[0])[0]
 
     def depth_maps(self, views: Sequence[View]) -> list[DepthMap]:
-        """Depth of every view of a capture; each is matched once and checked against its neighbours."""
-        return self._maps(list(views), self._helpers(list(views)), wanted=range(len(views)))
+        """Depth of every view of a capture; each is matched once and checked against others.
+
+        A view that no other one helps gets depth 0, unknown, everywhere.
+        """
+        return self._maps(list(views), self.neighbours(list(views)), wanted=range(len(views)))
 
     def point_maps(self, first: View, second: View) -> PointMaps:
-        """Both views' points in the first camera's frame."""
-        one, two = self._maps([first, second], [[1], [0]], wanted=(0, 1))
+        """Both views' points in the first camera's frame.
+
+        InputError if the two do not see the scene from usefully different angles.
+        """
+        helpers = self.neighbours([first, second])
+        _require_helpers(first, helpers[0])
+        one, two = self._maps([first, second], helpers, wanted=(0, 1))
         return point_maps_of(first, one, second, two)
 
-    def _helpers(self, views: list[View]) -> list[list[int]]:
+    def neighbours(self, views: Sequence[View]) -> list[list[int]]:
+        """Indices of the views that help each view, the most useful first."""
         cameras = [view.camera for view in views]
-        helpers = choose_neighbours(cameras, scene_center(cameras), self.config.neighbours)
-        for view, chosen in zip(views, helpers, strict=True):
-            if not chosen:
-                raise InputError(
-                    f"{view.name or 'a view'}: no other view sees the scene from within 45°, which "
-                    "depth=stereo needs; use depth=dataset or add photographs"
-                )
-        return helpers
+        return choose_neighbours(cameras, scene_center(cameras), self.config.neighbours)
 
     def _maps(
         self, views: list[View], helpers: list[list[int]], wanted: Sequence[int]
@@ -73,12 +80,17 @@ class PlaneSweepStereo:
         center = scene_center([view.camera for view in views])
         needed = sorted({*wanted, *(j for i in wanted for j in helpers[i])})
         estimates = {
-            i: self._estimate(working[i], [working[j] for j in helpers[i]], center) for i in needed
+            i: self._estimate(working[i], [working[j] for j in helpers[i]], center)
+            for i in needed
+            if helpers[i]
         }
         maps = []
         for i in wanted:
-            checked = _checked(i, helpers[i], working, estimates)
-            maps.append(_enlarged(checked, views[i].camera.height, views[i].camera.width))
+            height, width = views[i].camera.height, views[i].camera.width
+            if helpers[i]:
+                maps.append(_enlarged(_checked(i, helpers[i], working, estimates), height, width))
+            else:
+                maps.append(DepthMap(*views[i].image.new_zeros(2, height, width)))
         return maps
 
     def _working(self, view: View) -> View:
@@ -96,6 +108,14 @@ class PlaneSweepStereo:
     ) -> Estimate:
         bounds = inverse_depth_range(view.camera, [n.camera for n in neighbours], center)
         return sweep(view, neighbours, bounds, self.config.planes)
+
+
+def _require_helpers(view: View, helpers: list[int]) -> None:
+    if not helpers:
+        raise InputError(
+            f"{view.name or 'a view'}: no other view sees the scene from 3° to 45° beside it, "
+            "which depth=stereo needs; use depth=dataset or add photographs"
+        )
 
 
 def _checked(

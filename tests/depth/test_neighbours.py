@@ -1,0 +1,28 @@
+from traced_scenes import orbit_camera
+
+from extrap_train.depth.depth_range import scene_center
+from extrap_train.depth.neighbours import choose_neighbours
+
+
+def chosen(azimuths_deg: list[float], count: int) -> list[list[float]]:
+    cameras = [orbit_camera(azimuth_deg, 64) for azimuth_deg in azimuths_deg]
+    indices = choose_neighbours(cameras, scene_center(cameras), count)
+    return [[azimuths_deg[i] for i in row] for row in indices]
+
+
+def test_both_sides_at_useful_angles():
+    for start, row in zip(range(0, 360, 2), chosen(list(range(0, 360, 2)), 4), strict=True):
+        offsets = [(azimuth - start + 180) % 360 - 180 for azimuth in row]
+        assert len(row) == 4
+        assert sum(offset > 0 for offset in offsets) == 2
+        assert all(6 <= abs(offset) <= 20 for offset in offsets)
+
+
+def test_the_end_of_an_arc_takes_what_there_is():
+    assert set(chosen([0, 12, 24, 80], 4)[0]) == {12, 24}
+
+
+def test_neither_the_same_place_nor_the_far_side():
+    rows = chosen([0, 1, 15, 90], 4)
+    assert rows[0] == [15]
+    assert rows[3] == []
