@@ -61,7 +61,7 @@ def _fitted(parts: list[Part], turn_rad: float) -> list[Part]:
     low, high = corners.min(0), corners.max(0)
     scale = 1 / (high - low).max()
     shift = -scale * np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
-    return [_after(placement(tuple(shift), scale=scale), part) for part in turned]
+    return [_after(placement(shift, scale=scale), part) for part in turned]
 
 
 def _after(transform: np.ndarray, part: Part) -> Part:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from extrap_train.data.synthetic.material import Color, Numbers, Surface, mix, step
+from extrap_train.data.synthetic.vectors import Real
 
 
 @dataclass(frozen=True)
@@ -17,10 +18,10 @@ class Place:
     """0 at the zone's lower edge, 1 at its upper."""
     around: Numbers
     """Turns around the cup, in repeats of the pattern."""
-    zone: float
+    zone: Real
     """Height of the zone."""
     repeats: int
-    width: float
+    width: Real
     """Length of one repeat."""
     blur: Numbers
     """Width of a pixel."""
@@ -38,9 +39,9 @@ class Glaze:
     second: Color
     pattern: Pattern
     repeats: int
-    low: float
-    high: float
-    radius: float
+    low: Real
+    high: Real
+    radius: Real
 
     def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
         """Reflectance in linear light."""

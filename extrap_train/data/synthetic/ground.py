@@ -14,6 +14,7 @@ from extrap_train.data.synthetic.material import (
 )
 from extrap_train.data.synthetic.scene import Part, placement
 from extrap_train.data.synthetic.shapes import flat_ground, lathe, rounded_box
+from extrap_train.data.synthetic.vectors import Real
 
 WOODS = ["#a06a3d", "#b9834c", "#8a5c36", "#d0aa74", "#6e4a34"]
 FLOOR_WOODS = ["#b98a58", "#cfa56e", "#a67c55", "#d8bd92", "#94724f", "#b5a48c"]
@@ -95,13 +96,13 @@ def table_wood(rng: np.random.Generator) -> Texture:
     )
 
 
-def wide_ground(texture: Texture, half: float, gloss: float = 0.0) -> list[Part]:
+def wide_ground(texture: Texture, half: Real, gloss: Real = 0.0) -> list[Part]:
     """A ground that reaches as far as the surroundings do."""
     material = Material(texture, gloss)
     return [Part(flat_ground((half, half)), material, is_object=False, casts_shadow=False)]
 
 
-def table(rng: np.random.Generator, floor_height: float) -> list[Part]:
+def table(rng: np.random.Generator, floor_height: Real) -> list[Part]:
     """A table under the object, tall as seen from an apple; its floor lies at `floor_height`."""
     texture = table_wood(rng) if rng.random() < 0.65 else carpet(rng)
     material = Material(texture, gloss=0.08 if isinstance(texture, Tiles) else 0.0)

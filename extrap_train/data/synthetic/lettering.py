@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from extrap_train.data.synthetic.material import Color, Numbers, Surface, mix, step
 from extrap_train.data.synthetic.noise import fractal_noise
+from extrap_train.data.synthetic.vectors import Real
 
 
 @dataclass(frozen=True)
@@ -16,11 +17,11 @@ class Cover:
     ground: Color
     ink: Color
     second: Color
-    size: tuple[float, float]
+    size: tuple[Real, Real]
     """Width (local X) and height (local Y)."""
     emblem: int
     """0 a disc, 1 a triangle, 2 diagonal stripes, 3 two blocks."""
-    title_at: float
+    title_at: Real
     """Height of the title on the cover, -0.5 … 0.5."""
     border: bool
     seed: int
@@ -62,7 +63,7 @@ class Spine:
 
     ground: Color
     ink: Color
-    length: float
+    length: Real
     seed: int
 
     def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
@@ -94,8 +95,8 @@ def _lettering(
     u: Numbers,
     v: Numbers,
     rows: int,
-    pitch: float,
-    half_width: float,
+    pitch: Real,
+    half_width: Real,
     seed: int,
     blur: Numbers,
 ) -> Numbers:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from extrap_train.data.synthetic.noise import fractal_noise
+from extrap_train.data.synthetic.vectors import Real
 
 Color = Float[np.ndarray, " 3"]
 Numbers = Float[np.ndarray, " n"]
@@ -43,14 +44,14 @@ class Material:
     """A texture and how it answers light."""
 
     texture: Texture
-    gloss: float = 0.0
+    gloss: Real = 0.0
     """Strength of the highlight."""
-    shininess: float = 60.0
+    shininess: Real = 60.0
     """Blinn-Phong exponent."""
-    roughness: float = 0.0
+    roughness: Real = 0.0
     """How far fine noise tilts the normals."""
-    roughness_frequency: float = 20.0
-    glow: float = 0.0
+    roughness_frequency: Real = 20.0
+    glow: Real = 0.0
     """Share of the colour that shines by itself (sky, lamps)."""
 
 
@@ -70,7 +71,7 @@ def linear_to_srgb(linear: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3
     return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-def varied(rng: np.random.Generator, codes: list[str], spread: float = 0.12) -> Color:
+def varied(rng: np.random.Generator, codes: list[str], spread: Real = 0.12) -> Color:
     """One of the colours, a little lighter, darker or tinted."""
     color = linear_color(codes[rng.integers(len(codes))])
     tint = rng.normal(0, spread / 2, 3) + rng.normal(0, spread)
@@ -106,11 +107,11 @@ class Mottled:
 
     low: Color
     high: Color
-    frequency: float
+    frequency: Real
     seed: int
     octaves: int = 3
-    contrast: float = 1.0
-    stretch: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    contrast: Real = 1.0
+    stretch: tuple[Real, Real, Real] = (1.0, 1.0, 1.0)
 
     def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
         """Reflectance in linear light."""
@@ -128,7 +129,7 @@ class Wood:
     high: Color
     seed: int
     axis: int = 2
-    rings: float = 9.0
+    rings: Real = 9.0
     """Per unit length."""
 
     def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
@@ -152,12 +153,12 @@ class Tiles:
 
     inside: Texture
     joint: Color
-    size: tuple[float, float]
+    size: tuple[Real, Real]
     seed: int
-    joint_width: float = 0.03
-    offset: float = 0.0
+    joint_width: Real = 0.03
+    offset: Real = 0.0
     """Shift of every other row, as a share of a tile."""
-    shades: float = 0.25
+    shades: Real = 0.25
     """Spread of the tiles' brightness."""
     second: Color | None = None
     """Every other tile in this colour, as on a chessboard."""
@@ -194,8 +195,8 @@ class Plaid:
     base: Color
     warp: Color
     weft: Color
-    period: float
-    width: float = 0.4
+    period: Real
+    width: Real = 0.4
     """Share of the period that a band takes."""
 
     def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
@@ -217,11 +218,11 @@ class Worn:
 
     under: Texture
     stain: Color
-    amount: float
+    amount: Real
     """0 is spotless, 1 about half covered."""
-    frequency: float
+    frequency: Real
     seed: int
-    low_height: float = 0.25
+    low_height: Real = 0.25
     """Height below which dirt gathers."""
 
     def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:

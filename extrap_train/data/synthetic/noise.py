@@ -1,17 +1,20 @@
 """Gradient noise in space: the grain of every procedural texture."""
 
+from typing import no_type_check
+
 import numpy as np
 from jaxtyping import Float
 from numba import njit
 
-_KEPT, _GONE = (
-    0.25,
-    0.9,
-)  # footprint in wavelengths: an octave fades between the two, so nothing aliases
+from extrap_train.data.synthetic.vectors import Real
+
+_KEPT, _GONE = 0.25, 0.9
+"""Footprint in wavelengths between which an octave fades, so that nothing aliases."""
 
 
-@njit(cache=True, inline="always")
-def _hash(x: int, y: int, z: int, seed: int) -> int:
+@njit(cache=True)
+@no_type_check
+def _hash(x, y, z, seed):  # noqa: ANN001, ANN202
     """32 well-mixed bits of a lattice point."""
     h = (x * 0x8DA6B343 + y * 0xD8163841 + z * 0xCB1AB31F + seed * 0x9E3779B1) & 0xFFFFFFFF
     h = ((h ^ (h >> 15)) * 0x2C1B3C6D) & 0xFFFFFFFF
@@ -19,8 +22,9 @@ def _hash(x: int, y: int, z: int, seed: int) -> int:
     return h ^ (h >> 15)
 
 
-@njit(cache=True, inline="always")
-def _slope(h: int, x: float, y: float, z: float) -> float:
+@njit(cache=True)
+@no_type_check
+def _slope(h, x, y, z):  # noqa: ANN001, ANN202
     """Dot product with one of Perlin's twelve edge gradients."""
     h = h & 15
     a = x if h < 8 else y
@@ -28,8 +32,9 @@ def _slope(h: int, x: float, y: float, z: float) -> float:
     return (a if h & 1 == 0 else -a) + (b if h & 2 == 0 else -b)
 
 
-@njit(cache=True, inline="always")
-def _perlin(x: float, y: float, z: float, seed: int) -> float:
+@njit(cache=True)
+@no_type_check
+def _perlin(x, y, z, seed):  # noqa: ANN001, ANN202
     """Perlin's improved noise (2002), about −0.9 … 0.9."""
     i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
     x, y, z = x - i, y - j, z - k
@@ -45,9 +50,8 @@ def _perlin(x: float, y: float, z: float, seed: int) -> float:
 
 
 @njit(cache=True)
-def _fractal(
-    points: np.ndarray, footprint: np.ndarray, frequency: float, octaves: int, seed: int
-) -> np.ndarray:
+@no_type_check
+def _fractal(points, footprint, frequency, octaves, seed):  # noqa: ANN001, ANN202
     out = np.empty(len(points), np.float32)
     for n in range(len(points)):
         total, amplitude, f = 0.0, 0.5, frequency
@@ -65,7 +69,7 @@ def _fractal(
 def fractal_noise(
     points: Float[np.ndarray, "n 3"],
     footprint: Float[np.ndarray, " n"],
-    frequency: float,
+    frequency: Real,
     octaves: int,
     seed: int,
 ) -> Float[np.ndarray, " n"]:

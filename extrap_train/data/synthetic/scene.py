@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import no_type_check
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
@@ -11,7 +12,8 @@ from numba import njit
 
 from extrap_train.data.synthetic.light import Light, ambient_light
 from extrap_train.data.synthetic.material import Material
-from extrap_train.data.synthetic.shapes import Mesh, merge, moved
+from extrap_train.data.synthetic.shapes import Mesh, Point, merge, moved
+from extrap_train.data.synthetic.vectors import Real
 
 
 @dataclass(frozen=True)
@@ -28,10 +30,10 @@ class Part:
 
 
 def placement(
-    position: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    turn_rad: float = 0.0,
-    tilt_rad: float = 0.0,
-    scale: float = 1.0,
+    position: Point = (0, 0, 0),
+    turn_rad: Real = 0,
+    tilt_rad: Real = 0,
+    scale: Real = 1,
 ) -> Float[np.ndarray, "4 4"]:
     """Scale, then tilt about +X, then turn about +Z, then shift."""
     ct, st, cz, sz = np.cos(tilt_rad), np.sin(tilt_rad), np.cos(turn_rad), np.sin(turn_rad)
@@ -122,9 +124,8 @@ def _embree(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -
 
 
 @njit(cache=True)
-def _interpolate(
-    attributes: np.ndarray, faces: np.ndarray, face: np.ndarray, u: np.ndarray, v: np.ndarray
-) -> np.ndarray:
+@no_type_check
+def _interpolate(attributes, faces, face, u, v):  # noqa: ANN001, ANN202
     out = np.empty((len(face), attributes.shape[1]), np.float32)
     for n in range(len(face)):
         a, b, c = faces[face[n], 0], faces[face[n], 1], faces[face[n], 2]

@@ -6,9 +6,12 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Int
 
-from extrap_train.data.synthetic.vectors import rotated
+from extrap_train.data.synthetic.vectors import Real, rotated
 
 _CREASE = np.cos(np.deg2rad(35.0))
+
+
+Point = tuple[Real, Real, Real] | Float[np.ndarray, " 3"]
 
 
 @dataclass(frozen=True)
@@ -20,7 +23,7 @@ class Mesh:
     normals: Float[np.ndarray, "v 3"]
 
 
-def xyz(x: float, y: float, z: float) -> Float[np.ndarray, " 3"]:
+def xyz(x: Real, y: Real, z: Real) -> Float[np.ndarray, " 3"]:
     """A point or an offset."""
     return np.array([x, y, z], float)
 
@@ -54,7 +57,7 @@ def _split_corners(profile: Float[np.ndarray, "k 2"]) -> list[np.ndarray]:
 
 def sweep(
     path: Float[np.ndarray, "k 3"],
-    radii: Float[np.ndarray, " k"] | float,
+    radii: Float[np.ndarray, " k"] | Real,
     segments: int = 10,
     flatten: float = 1.0,
 ) -> Mesh:
@@ -95,7 +98,7 @@ def _sideways(tangents: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
     return side
 
 
-def rounded_box(size: tuple[float, float, float], radius: float = 0.0, steps: int = 2) -> Mesh:
+def rounded_box(size: Point, radius: Real = 0, steps: int = 2) -> Mesh:
     """A box centred at the origin whose edges are rounded by `radius`."""
     half = np.asarray(size, float) / 2
     radius = min(radius, float(half.min()) * 0.999)
@@ -119,7 +122,7 @@ def rounded_box(size: tuple[float, float, float], radius: float = 0.0, steps: in
     return merge(patches)
 
 
-def ellipsoid(radii: tuple[float, float, float], segments: int = 24, power: float = 1.0) -> Mesh:
+def ellipsoid(radii: Point, segments: int = 24, power: Real = 1) -> Mesh:
     """An ellipsoid centred at the origin; `power` below 1 makes it boxier (a superquadric)."""
     latitude = np.linspace(-np.pi / 2, np.pi / 2, segments // 2 + 1)
     profile = np.stack([np.cos(latitude), np.sin(latitude)], -1)
@@ -132,8 +135,8 @@ def ellipsoid(radii: tuple[float, float, float], segments: int = 24, power: floa
 def capsule(
     start: Float[np.ndarray, " 3"],
     end: Float[np.ndarray, " 3"],
-    radius: float,
-    end_radius: float | None = None,
+    radius: Real,
+    end_radius: Real | None = None,
     segments: int = 16,
 ) -> Mesh:
     """A limb between two points with round ends, tapering to `end_radius`."""
@@ -160,7 +163,7 @@ def sheet(points: Float[np.ndarray, "r c 3"]) -> Mesh:
     return _grid_mesh(np.asarray(points, float), np.arange(len(points) - 1), closed=False)
 
 
-def flat_ground(half: tuple[float, float], lines: int = 44) -> Mesh:
+def flat_ground(half: tuple[Real, Real], lines: int = 44) -> Mesh:
     """A rectangle in the plane z = 0, finely divided near its centre to carry soft shading."""
     spread = np.sinh(np.linspace(-3.2, 3.2, lines)) / np.sinh(3.2)
     x, y = np.meshgrid(spread * half[0], spread * half[1], indexing="ij")

@@ -23,12 +23,14 @@ from extrap_train.data.synthetic.noise import fractal_noise
 from extrap_train.data.synthetic.scene import Part, placement
 from extrap_train.data.synthetic.shapes import (
     Mesh,
+    Point,
     capsule,
     displaced,
     ellipsoid,
     lathe,
     rounded_box,
 )
+from extrap_train.data.synthetic.vectors import Real
 
 _SKY_RADIUS = 19.0
 _PAINTS = ["#b5483c", "#3f6fa3", "#d8b24a", "#5c8a5a", "#cfc6b6", "#6d5a86", "#444b55", "#c98a4b"]
@@ -108,12 +110,9 @@ def on_table(rng: np.random.Generator) -> list[Part]:
     return parts
 
 
-Spot = tuple[float, float, float]
-
-
 def _around(
-    rng: np.random.Generator, count: int, nearest: float, farthest: float
-) -> list[tuple[Spot, float]]:
+    rng: np.random.Generator, count: int, nearest: Real, farthest: Real
+) -> list[tuple[Point, float]]:
     """Spots spread over the circle, each with the turn that faces the centre."""
     angles = 2 * np.pi * (np.arange(count) + rng.uniform(-0.35, 0.35, count)) / count
     angles += rng.uniform(0, 2 * np.pi)
@@ -124,7 +123,7 @@ def _around(
     ]
 
 
-def _scenery(mesh: Mesh, material: Material, spot: Spot, turn: float, scale: float = 1.0) -> Part:
+def _scenery(mesh: Mesh, material: Material, spot: Point, turn: Real, scale: Real = 1.0) -> Part:
     return Part(mesh, material, placement(spot, turn, scale=scale), is_object=False)
 
 
@@ -134,7 +133,7 @@ def _dome(texture: Texture) -> Part:
 
 
 def _room(
-    rng: np.random.Generator, half: Float[np.ndarray, " 2"], floor: float, height: float
+    rng: np.random.Generator, half: Float[np.ndarray, " 2"], floor: Real, height: Real
 ) -> list[Part]:
     """Four walls and a ceiling with pictures and windows."""
     tone = varied(rng, ["#d8cfc0", "#b9c4c0", "#c7b299", "#a9b3c4", "#cdbfc3", "#9aa78f"])
@@ -164,7 +163,7 @@ def _room(
     return parts
 
 
-def _hanging(rng: np.random.Generator, spot: Spot, turn: float) -> list[Part]:
+def _hanging(rng: np.random.Generator, spot: Point, turn: Real) -> list[Part]:
     """A picture, a door-like panel or a bright window on a wall."""
     width, height = rng.uniform(0.8, 2.2), rng.uniform(0.8, 1.8)
     frame = rounded_box((width + 0.16, 0.1, height + 0.16))
@@ -185,12 +184,12 @@ def _hanging(rng: np.random.Generator, spot: Spot, turn: float) -> list[Part]:
     ]
 
 
-def _bush(rng: np.random.Generator, spot: Spot, turn: float) -> list[Part]:
+def _bush(rng: np.random.Generator, spot: Point, turn: Real) -> list[Part]:
     size = rng.uniform(0.6, 1.3)
     return [_foliage(rng, (spot[0], spot[1], size * 0.45), size)]
 
 
-def _foliage(rng: np.random.Generator, spot: Spot, size: float) -> Part:
+def _foliage(rng: np.random.Generator, spot: Point, size: Real) -> Part:
     green = varied(rng, ["#3f6b2f", "#56803a", "#6f8a3f", "#7f7a3a", "#9a5f3a"])
     ball = ellipsoid((0.55, 0.5, 0.5), 20)
     flat = np.zeros(len(ball.vertices), np.float32)
@@ -200,7 +199,7 @@ def _foliage(rng: np.random.Generator, spot: Spot, size: float) -> Part:
     return _scenery(mesh, Material(texture, roughness=0.6), spot, rng.uniform(0, 6), size)
 
 
-def _tree(rng: np.random.Generator, spot: Spot, turn: float) -> list[Part]:
+def _tree(rng: np.random.Generator, spot: Point, turn: Real) -> list[Part]:
     height = rng.uniform(2.0, 3.2)
     bark = varied(rng, ["#5a4632", "#7a6a55", "#4a4038"])
     trunk = lathe(np.array([[0.22, 0], [0.14, 0.4], [0.11, height]]), 12)
@@ -212,14 +211,14 @@ def _tree(rng: np.random.Generator, spot: Spot, turn: float) -> list[Part]:
     ]
 
 
-def _wall(rng: np.random.Generator, spot: Spot, turn: float) -> list[Part]:
+def _wall(rng: np.random.Generator, spot: Point, turn: Real) -> list[Part]:
     size = (rng.uniform(1.5, 3.0), 0.3, rng.uniform(0.5, 1.4))
     texture = ground.bricks(rng) if rng.random() < 0.6 else ground.pavement(rng)
     middle = (spot[0], spot[1], size[2] / 2)
     return [_scenery(rounded_box(size, 0.03, 1), Material(texture), middle, turn)]
 
 
-def _crate(rng: np.random.Generator, spot: Spot, turn: float, scale: float = 1.0) -> list[Part]:
+def _crate(rng: np.random.Generator, spot: Point, turn: Real, scale: Real = 1.0) -> list[Part]:
     size = rng.uniform(0.4, 1.0, 3) * scale
     tone = varied(rng, _PAINTS)
     inside = Mottled(tone * 0.7, tone * 1.2, 5.0, draw_seed(rng), 2, stretch=(1, 1, 0.3))
@@ -229,7 +228,7 @@ def _crate(rng: np.random.Generator, spot: Spot, turn: float, scale: float = 1.0
     return [_scenery(rounded_box(tuple(size), 0.03, 1), Material(texture), middle, twist)]
 
 
-def _post(rng: np.random.Generator, spot: Spot, turn: float) -> list[Part]:
+def _post(rng: np.random.Generator, spot: Point, turn: Real) -> list[Part]:
     radius, height = rng.uniform(0.06, 0.2), rng.uniform(0.8, 3.0)
     profile = np.array(
         [
@@ -245,7 +244,7 @@ def _post(rng: np.random.Generator, spot: Spot, turn: float) -> list[Part]:
     return [_scenery(lathe(profile, 14), Material(texture, 0.3), spot, turn)]
 
 
-def _house(rng: np.random.Generator, spot: Spot, turn: float) -> list[Part]:
+def _house(rng: np.random.Generator, spot: Point, turn: Real) -> list[Part]:
     size = (rng.uniform(3, 6), rng.uniform(2, 4), rng.uniform(2, 6))
     tone = varied(rng, ["#c9bfae", "#b08a6a", "#a9adb0", "#d3c48f", "#9a6a5a"])
     panes = Plain(varied(rng, ["#3a4a5a", "#55646e"]))
@@ -254,7 +253,7 @@ def _house(rng: np.random.Generator, spot: Spot, turn: float) -> list[Part]:
     return [_scenery(rounded_box(size), Material(texture), middle, turn)]
 
 
-def _cabinet(rng: np.random.Generator, spot: Spot, turn: float, scale: float = 1.0) -> list[Part]:
+def _cabinet(rng: np.random.Generator, spot: Point, turn: Real, scale: Real = 1.0) -> list[Part]:
     size = (rng.uniform(0.8, 2.0) * scale, 0.5 * scale, rng.uniform(0.5, 2.2) * scale)
     tone = varied(rng, ground.WOODS + _PAINTS[4:6])
     grain = Mottled(tone * 0.65, tone * 1.25, 4.0, draw_seed(rng), 2, stretch=(0.2, 0.2, 1))
@@ -264,7 +263,7 @@ def _cabinet(rng: np.random.Generator, spot: Spot, turn: float, scale: float = 1
     return [_scenery(rounded_box(size, 0.02, 1), Material(texture, 0.1), middle, turn)]
 
 
-def _lamp(rng: np.random.Generator, spot: Spot, turn: float, scale: float = 1.0) -> list[Part]:
+def _lamp(rng: np.random.Generator, spot: Point, turn: Real, scale: Real = 1.0) -> list[Part]:
     height = rng.uniform(1.6, 2.4) * scale
     metal = Material(Plain(varied(rng, ["#3a3a3c", "#a08a5a", "#c8c8c8"])), 0.4)
     pole = lathe(np.array([[0.3, 0], [0.3, 0.05], [0.04, 0.07], [0.04, height]]), 12)
@@ -273,7 +272,7 @@ def _lamp(rng: np.random.Generator, spot: Spot, turn: float, scale: float = 1.0)
     return [_scenery(pole, metal, spot, turn), _scenery(shade, cloth, spot, turn)]
 
 
-def _plant(rng: np.random.Generator, spot: Spot, turn: float, scale: float = 1.0) -> list[Part]:
+def _plant(rng: np.random.Generator, spot: Point, turn: Real, scale: Real = 1.0) -> list[Part]:
     size = rng.uniform(0.35, 0.6) * scale
     pot = lathe(np.array([[0.3, 0], [0.45, 0.8], [0.38, 0.8], [0.36, 0.7], [0, 0.7]]) * size, 18)
     dark, pale = (varied(rng, ["#a85f40", "#d8d2c4", "#4f5f6f"]) for _ in range(2))
@@ -282,7 +281,7 @@ def _plant(rng: np.random.Generator, spot: Spot, turn: float, scale: float = 1.0
     return [_scenery(pot, clay, spot, turn), leaves]
 
 
-def _small_thing(rng: np.random.Generator, spot: Spot, turn: float) -> list[Part]:
+def _small_thing(rng: np.random.Generator, spot: Point, turn: Real) -> list[Part]:
     """A box, a bottle or a ball near the edge of a table."""
     tone = varied(rng, _PAINTS)
     material = Material(Mottled(tone * 0.7, varied(rng, _PAINTS), 3.0, draw_seed(rng), 2, 1.5), 0.2)

@@ -1,12 +1,17 @@
 """Arithmetic on many 3-vectors; unlike BLAS it gives the same bits for any number of threads."""
 
+from typing import no_type_check
+
 import numpy as np
 from jaxtyping import Float
 from numba import njit
 
+Real = int | float
+
 
 @njit(cache=True)
-def _rotated(vectors: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+@no_type_check
+def _rotated(vectors, matrix):  # noqa: ANN001, ANN202
     out = np.empty_like(vectors)
     for n in range(len(vectors)):
         x, y, z = vectors[n, 0], vectors[n, 1], vectors[n, 2]
@@ -16,7 +21,8 @@ def _rotated(vectors: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True)
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+@no_type_check
+def _dot(a, b):  # noqa: ANN001, ANN202
     out = np.empty(len(a), a.dtype)
     for n in range(len(a)):
         out[n] = a[n, 0] * b[n, 0] + a[n, 1] * b[n, 1] + a[n, 2] * b[n, 2]
@@ -24,7 +30,8 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True)
-def _normalized(vectors: np.ndarray) -> np.ndarray:
+@no_type_check
+def _normalized(vectors):  # noqa: ANN001, ANN202
     out = np.empty_like(vectors)
     for n in range(len(vectors)):
         x, y, z = vectors[n, 0], vectors[n, 1], vectors[n, 2]
@@ -40,7 +47,7 @@ def rotated(
     return _rotated(np.ascontiguousarray(vectors), np.ascontiguousarray(matrix, vectors.dtype))
 
 
-def dot(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "#n 3"]) -> Float[np.ndarray, " n"]:
+def dot(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, " n"]:
     """Dot products of corresponding vectors."""
     return _dot(np.ascontiguousarray(a), np.broadcast_to(b, a.shape).astype(a.dtype, copy=False))
 

@@ -9,6 +9,7 @@ from extrap_train.data.synthetic.lettering import Cover, Pages, Spine
 from extrap_train.data.synthetic.material import Material, varied
 from extrap_train.data.synthetic.scene import Part, placement
 from extrap_train.data.synthetic.shapes import rounded_box
+from extrap_train.data.synthetic.vectors import Real
 
 _CLOTHS = [
     "#8f2a2a",
@@ -44,15 +45,15 @@ def build(rng: np.random.Generator) -> list[Part]:
 class _Binding:
     """A book's looks and measures."""
 
-    width: float
-    height: float
+    width: Real
+    height: Real
     thickness: float
     cover: Material
     spine: Material
     pages: Material
 
 
-def _binding(rng: np.random.Generator, scale: float) -> _Binding:
+def _binding(rng: np.random.Generator, scale: Real) -> _Binding:
     height = scale
     width = height * rng.uniform(0.64, 0.85)
     thickness = rng.uniform(0.14, 0.28) * scale
@@ -70,7 +71,7 @@ def _binding(rng: np.random.Generator, scale: float) -> _Binding:
 
 
 def _lying(
-    rng: np.random.Generator, base: float, scale: float, turn: float
+    rng: np.random.Generator, base: Real, scale: Real, turn: Real
 ) -> tuple[list[Part], float]:
     """A closed book, its front up, and the height of its top; the spine is at −X."""
     book = _binding(rng, scale)
@@ -106,7 +107,7 @@ def _standing(rng: np.random.Generator) -> list[Part]:
     return [*covers, *pages, Part(spine, book.spine, _upright(book, 0.0, share=0.0))]
 
 
-def _upright(book: _Binding, angle: float, share: float = 0.5) -> np.ndarray:
+def _upright(book: _Binding, angle: Real, share: Real = 0.5) -> np.ndarray:
     """A leaf's pose: local Y up, local X away from the spine; fronts face negative angles."""
     out = np.array([np.cos(angle), np.sin(angle), 0.0])
     up = np.array([0.0, 0.0, 1.0])

@@ -16,6 +16,7 @@ from extrap_train.data.synthetic.shapes import (
     sweep,
     xyz,
 )
+from extrap_train.data.synthetic.vectors import Real
 
 Back = Callable[[float, float], np.ndarray]
 """A point of the back: -1 left … 1 right, 0 seat … 1 top."""
@@ -56,9 +57,7 @@ def _cloth(rng: np.random.Generator) -> Material:
     return Material(Mottled(base * 0.6, base * 1.3, rng.uniform(10, 22), draw_seed(rng)))
 
 
-def _seat(
-    rng: np.random.Generator, size: tuple[float, float, float], frame: Material
-) -> list[Part]:
+def _seat(rng: np.random.Generator, size: tuple[Real, Real, Real], frame: Material) -> list[Part]:
     width, depth, height = size
     board = rounded_box((width, depth, 0.04), 0.015)
     parts = [Part(board, frame, placement((0, 0, height)))]
@@ -69,9 +68,7 @@ def _seat(
     return parts
 
 
-def _legs(
-    rng: np.random.Generator, size: tuple[float, float, float], frame: Material
-) -> list[Part]:
+def _legs(rng: np.random.Generator, size: tuple[Real, Real, Real], frame: Material) -> list[Part]:
     width, depth, height = size
     thick, splay = rng.uniform(0.02, 0.032), rng.uniform(0, 0.06)
     taper = rng.uniform(0.6, 1.0)
@@ -95,7 +92,7 @@ def _legs(
     return parts
 
 
-def _pedestal(rng: np.random.Generator, seat: float, width: float) -> list[Part]:
+def _pedestal(rng: np.random.Generator, seat: Real, width: Real) -> list[Part]:
     """A column on a round foot or on five spokes with castors."""
     metal = Material(Plain(varied(rng, ["#8f9296", "#2c2c30", "#c9c9c6"])), 0.6, 50)
     column = lathe(np.array([[0.035, 0.05], [0.035, 0.2], [0.025, 0.2], [0.025, seat]]), 16)
@@ -113,14 +110,14 @@ def _pedestal(rng: np.random.Generator, seat: float, width: float) -> list[Part]
 
 
 def _back(
-    rng: np.random.Generator, size: tuple[float, float, float], top: float, frame: Material
+    rng: np.random.Generator, size: tuple[Real, Real, Real], top: Real, frame: Material
 ) -> list[Part]:
     """Two posts that lean back, and what is between them."""
     width, depth, seat = size
     lean = rng.uniform(0.03, 0.14)
     x, y = width / 2 - 0.03, depth / 2 - 0.03
 
-    def at(share_x: float, share_z: float) -> np.ndarray:
+    def at(share_x: Real, share_z: Real) -> np.ndarray:
         return np.array([share_x * x, y + lean * share_z**1.4, seat + share_z * (top - seat)])
 
     posts = [Part(capsule(at(s, 0), at(s, 1), 0.024, 0.02, 12), frame) for s in (-1, 1)]
@@ -143,25 +140,25 @@ def _back(
         case _:
             cushion = rounded_box((2 * x, rng.uniform(0.06, 0.1), (top - seat) * 0.85), 0.03, 3)
             tilt = -np.arctan2(lean, top - seat)
-            pose = placement(tuple(at(0, 0.58)), tilt_rad=tilt)
+            pose = placement(at(0, 0.58), tilt_rad=tilt)
             return [*posts, Part(cushion, _cloth(rng), pose)]
 
 
-def _rail(at: Back, share_z: float, half: float, frame: Material) -> Part:
+def _rail(at: Back, share_z: Real, half: Real, frame: Material) -> Part:
     """A slat across the back, bowed a little."""
     across = np.linspace(-1, 1, 9)
     path = np.array([at(s, share_z) + xyz(0, 0.03 * (1 - s * s), 0) for s in across])
     return Part(sweep(path, half, 10, flatten=0.35), frame)
 
 
-def _panel(at: Back, low: float, high: float) -> Mesh:
+def _panel(at: Back, low: Real, high: Real) -> Mesh:
     """A bent board between the posts."""
     grid = [[at(s, t) for s in np.linspace(-1, 1, 8)] for t in np.linspace(low, high, 8)]
     return sheet(np.array(grid))
 
 
 def _armrests(
-    rng: np.random.Generator, size: tuple[float, float, float], frame: Material
+    rng: np.random.Generator, size: tuple[Real, Real, Real], frame: Material
 ) -> list[Part]:
     width, depth, seat = size
     height, x = seat + rng.uniform(0.18, 0.26), width / 2

@@ -8,6 +8,7 @@ from extrap_train.data.synthetic.ground import draw_seed
 from extrap_train.data.synthetic.material import Material, Mottled, Plain, linear_color, varied
 from extrap_train.data.synthetic.scene import Part, placement
 from extrap_train.data.synthetic.shapes import Mesh, lathe, sweep
+from extrap_train.data.synthetic.vectors import Real
 
 _GLAZES = ["#e9e4d8", "#2f5f8f", "#b5382f", "#d9a83a", "#4f7f6a", "#2b2b30", "#c98fa0", "#8fb0c0"]
 
@@ -53,27 +54,27 @@ def build(rng: np.random.Generator) -> list[Part]:
     return parts
 
 
-def _profile(height: float, rim: float, foot: float, belly: float) -> Float[np.ndarray, "k 2"]:
+def _profile(height: Real, rim: Real, foot: Real, belly: Real) -> Float[np.ndarray, "k 2"]:
     t = np.linspace(0, 1, 14)
     radius = foot + (rim - foot) * t**0.7 + 4 * belly * t * (1 - t)
     return np.stack([radius, t * height], -1)
 
 
-def _outer(profile: Float[np.ndarray, "k 2"], wall: float) -> Mesh:
+def _outer(profile: Float[np.ndarray, "k 2"], wall: Real) -> Mesh:
     """Foot, side and the rounded rim."""
     top = profile[-1]
     lip = top + wall * np.array([[-0.2, 0.35], [-0.5, 0.45]])
     return lathe(np.concatenate([[[0, 0]], profile, lip]), 48)
 
 
-def _inner(profile: Float[np.ndarray, "k 2"], wall: float) -> Mesh:
+def _inner(profile: Float[np.ndarray, "k 2"], wall: Real) -> Mesh:
     top = profile[-1] + wall * np.array([-0.5, 0.45])
     side = (profile - [wall, 0])[::-1]
     side = side[side[:, 1] > wall * 1.5]
     return lathe(np.concatenate([[top], side, [[0, wall * 1.5]]]), 40)
 
 
-def _handle(rng: np.random.Generator, profile: Float[np.ndarray, "k 2"], height: float) -> Mesh:
+def _handle(rng: np.random.Generator, profile: Float[np.ndarray, "k 2"], height: Real) -> Mesh:
     """A loop, round, square-ish or ear-shaped."""
     low, high = rng.uniform(0.15, 0.3) * height, rng.uniform(0.72, 0.88) * height
     reach = rng.uniform(0.2, 0.32)
@@ -90,7 +91,7 @@ def _handle(rng: np.random.Generator, profile: Float[np.ndarray, "k 2"], height:
 
 
 def _drink(
-    rng: np.random.Generator, profile: Float[np.ndarray, "k 2"], wall: float, height: float
+    rng: np.random.Generator, profile: Float[np.ndarray, "k 2"], wall: Real, height: Real
 ) -> Part:
     level = height * rng.uniform(0.7, 0.9)
     radius = np.interp(level, profile[:, 1], profile[:, 0]) - wall * 0.8
@@ -99,7 +100,7 @@ def _drink(
     return Part(disc, Material(Mottled(color * 0.8, color * 1.2, 5.0, draw_seed(rng)), 0.8, 120))
 
 
-def _saucer(rng: np.random.Generator, rim: float, glaze: Material) -> Part:
+def _saucer(rng: np.random.Generator, rim: Real, glaze: Material) -> Part:
     wide = rim * rng.uniform(1.45, 1.75)
     profile = [
         [0, 0.0],

@@ -13,6 +13,7 @@ from extrap_train.data.synthetic.material import (
 )
 from extrap_train.data.synthetic.scene import Part, placement
 from extrap_train.data.synthetic.shapes import Mesh, lathe, merge, moved, sweep
+from extrap_train.data.synthetic.vectors import Real
 
 _PAINTS = ["#c2261f", "#d9b21f", "#2f5fa8", "#b4b8bb", "#dedcd2", "#3f7f4a", "#d9701f"]
 
@@ -53,7 +54,7 @@ def _paint(rng: np.random.Generator, color: Color) -> Material:
     return Material(worn, rng.uniform(0.1, 0.5), rng.uniform(15, 50), 0.12, 30.0)
 
 
-def _barrel(rng: np.random.Generator, radius: float, shoulder: float) -> Mesh:
+def _barrel(rng: np.random.Generator, radius: Real, shoulder: Real) -> Mesh:
     flange, ring = radius + rng.uniform(0.06, 0.1), radius + rng.uniform(0.025, 0.05)
     low = rng.uniform(0.1, 0.16)
     waist = radius * rng.uniform(0.86, 1.0)
@@ -66,7 +67,7 @@ def _barrel(rng: np.random.Generator, radius: float, shoulder: float) -> Mesh:
     return lathe(np.array(profile), 32)
 
 
-def _bolts(rng: np.random.Generator, radius: float) -> Mesh:
+def _bolts(rng: np.random.Generator, radius: Real) -> Mesh:
     """A ring of bolts on the base flange."""
     bolt = lathe(np.array([[0.022, 0.04], [0.022, 0.075], [0, 0.08]]), 6)
     count = int(rng.integers(5, 9))
@@ -76,7 +77,7 @@ def _bolts(rng: np.random.Generator, radius: float) -> Mesh:
     return merge([moved(bolt, placement((far * x, far * y, 0.0))) for x, y in spots])
 
 
-def _bonnet(rng: np.random.Generator, radius: float, shoulder: float) -> Mesh:
+def _bonnet(rng: np.random.Generator, radius: Real, shoulder: Real) -> Mesh:
     """A dome, a bell or a stepped cap, with the operating nut on top."""
     rim, height = radius + rng.uniform(0.03, 0.06), rng.uniform(0.16, 0.24)
     roundness = rng.uniform(0.7, 1.5)
@@ -100,10 +101,10 @@ def _bonnet(rng: np.random.Generator, radius: float, shoulder: float) -> Mesh:
 
 def _nozzles(
     rng: np.random.Generator,
-    radius: float,
-    height: float,
-    turns: list[float],
-    size: float,
+    radius: Real,
+    height: Real,
+    turns: list[Real],
+    size: Real,
     iron: Material,
     cap: Material,
 ) -> list[Part]:
@@ -136,7 +137,7 @@ def _nozzles(
     return parts
 
 
-def _chain(rng: np.random.Generator, radius: float, height: float) -> Part:
+def _chain(rng: np.random.Generator, radius: Real, height: Real) -> Part:
     """A sagging chain from one cap to the front."""
     t = np.linspace(0, 1, 14)
     angle = t * np.pi / 2

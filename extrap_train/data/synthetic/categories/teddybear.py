@@ -14,6 +14,7 @@ from extrap_train.data.synthetic.material import (
 )
 from extrap_train.data.synthetic.scene import Part, placement
 from extrap_train.data.synthetic.shapes import capsule, ellipsoid, merge, moved, sweep, xyz
+from extrap_train.data.synthetic.vectors import Real
 
 _FURS = ["#8a5a32", "#b98a55", "#d9c49a", "#5c3a24", "#8f8a86", "#e3dccf", "#c98f9a", "#a8713f"]
 _PADS = ["#d9c49a", "#f0e6d2", "#c9a070", "#e8cfc0", "#5a4030"]
@@ -49,14 +50,14 @@ def _fur(rng: np.random.Generator, color: Color) -> Material:
 def _head(rng: np.random.Generator, at: np.ndarray, fur: Material, pad: Material) -> list[Part]:
     radius = rng.uniform(0.19, 0.235)
     wide, long = rng.uniform(1.0, 1.15), rng.uniform(0.45, 0.62)
-    parts = [Part(ellipsoid((radius * wide, radius * 0.92, radius), 26), fur, placement(tuple(at)))]
+    parts = [Part(ellipsoid((radius * wide, radius * 0.92, radius), 26), fur, placement(at))]
     snout_at = at + xyz(0, -radius * 0.75, -radius * 0.25)
     snout = ellipsoid((radius * 0.48, radius * long, radius * 0.38), 18)
-    parts.append(Part(snout, pad, placement(tuple(snout_at))))
+    parts.append(Part(snout, pad, placement(snout_at)))
     black = Material(Plain(linear_color("#17120f")), 0.9, 40)
     nose = ellipsoid((radius * 0.19, radius * 0.12, radius * 0.13), 12)
     parts.append(
-        Part(nose, black, placement(tuple(snout_at + xyz(0, -radius * long * 0.92, radius * 0.2))))
+        Part(nose, black, placement(snout_at + xyz(0, -radius * long * 0.92, radius * 0.2)))
     )
     eye = ellipsoid((0.028, 0.022, 0.03), 12)
     ear_size, spread = radius * rng.uniform(0.36, 0.5), rng.uniform(0.62, 0.8)
@@ -64,15 +65,15 @@ def _head(rng: np.random.Generator, at: np.ndarray, fur: Material, pad: Material
     inner = ellipsoid((ear_size * 0.65, ear_size * 0.3, ear_size * 0.65), 14)
     for side in (-1, 1):
         eye_at = at + xyz(side * radius * 0.42, -radius * 0.82, radius * 0.2)
-        parts.append(Part(eye, black, placement(tuple(eye_at))))
+        parts.append(Part(eye, black, placement(eye_at)))
         ear_at = at + xyz(side * radius * wide * spread, 0, radius * 0.78)
-        parts.append(Part(ear, fur, placement(tuple(ear_at))))
-        parts.append(Part(inner, pad, placement(tuple(ear_at + xyz(0, -ear_size * 0.25, 0)))))
+        parts.append(Part(ear, fur, placement(ear_at)))
+        parts.append(Part(inner, pad, placement(ear_at + xyz(0, -ear_size * 0.25, 0))))
     return parts
 
 
 def _limbs(
-    rng: np.random.Generator, body: tuple[float, float, float], fur: Material, pad: Material
+    rng: np.random.Generator, body: tuple[Real, Real, Real], fur: Material, pad: Material
 ) -> list[Part]:
     width, depth, height = body
     arm, leg = rng.uniform(0.065, 0.085), rng.uniform(0.085, 0.11)
@@ -89,11 +90,11 @@ def _limbs(
         toward = (foot - hip) / np.linalg.norm(foot - hip)
         sole = ellipsoid((leg * 0.8, leg * 0.3, leg * 0.85), 16)
         turn = np.arctan2(toward[0], -toward[1])
-        parts.append(Part(sole, pad, placement(tuple(foot + toward * leg * 0.9), turn)))
+        parts.append(Part(sole, pad, placement(foot + toward * leg * 0.9, turn)))
     return parts
 
 
-def _shirt(rng: np.random.Generator, body: tuple[float, float, float]) -> Part:
+def _shirt(rng: np.random.Generator, body: tuple[Real, Real, Real]) -> Part:
     """A knitted pullover over the upper body."""
     width, depth, height = (x * 1.05 for x in body)
     base, warp, weft = (varied(rng, CLOTHS) for _ in range(3))
@@ -102,7 +103,7 @@ def _shirt(rng: np.random.Generator, body: tuple[float, float, float]) -> Part:
     return Part(shell, Material(cloth), placement((0, 0, body[2] * 1.2)))
 
 
-def _bow(rng: np.random.Generator, at: tuple[float, float, float]) -> Part:
+def _bow(rng: np.random.Generator, at: tuple[Real, Real, Real]) -> Part:
     """A ribbon tied under the chin."""
     size = rng.uniform(0.07, 0.11)
     loop = ellipsoid((size, size * 0.45, size * 0.62), 14)

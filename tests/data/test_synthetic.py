@@ -1,0 +1,93 @@
+"""Synthetic scenes: what is drawn, and from where."""
+
+import numpy as np
+import pytest
+import torch
+
+from extrap_train.config import CATEGORIES
+from extrap_train.data.synthetic import build_scene, handheld_orbit, render, surface_points
+from extrap_train.data.synthetic.shapes import moved
+from extrap_train.errors import InputError
+from extrap_train.geometry.cameras import project
+
+
+def object_vertices(scene):
+    parts = [part for part in scene.parts if part.is_object]
+    return np.concatenate([moved(part.mesh, part.part_to_world).vertices for part in parts])
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_every_object_is_sound_and_stands_on_the_ground(category):
+    for index in range(20):
+        scene = build_scene(category, index, seed=0)
+        vertices = object_vertices(scene)
+        assert np.isfinite(scene.mesh.vertices).all()
+        np.testing.assert_allclose(np.linalg.norm(scene.mesh.normals, axis=1), 1, atol=1e-6)
+        assert len(scene.mesh.faces) <= 20_000
+        np.testing.assert_allclose(vertices[:, 2].min(), 0, atol=1e-9)
+        np.testing.assert_allclose((vertices.max(0) - vertices.min(0)).max(), 1, atol=1e-9)
+        a, b, c = (scene.mesh.vertices[scene.mesh.faces[:, i]] for i in range(3))
+        assert np.linalg.norm(np.cross(b - a, c - a), axis=1).min() > 0
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_the_walk_closes_the_circle_and_keeps_the_object_in_frame(category):
+    for index in range(5):
+        scene = build_scene(category, index, seed=0)
+        cameras = handheld_orbit(scene, frames=24, image_size=64, seed=index)
+        offsets = cameras.center.numpy() - scene.look_at
+        azimuths = np.sort(np.arctan2(offsets[:, 1], offsets[:, 0]))
+        gaps = np.diff(azimuths, append=azimuths[0] + 2 * np.pi)
+        assert np.rad2deg(gaps.max()) < 30
+        elevations = np.rad2deg(np.arcsin(offsets[:, 2] / np.linalg.norm(offsets, axis=1)))
+        assert elevations.min() > 9
+        assert elevations.max() < 41
+        points = torch.from_numpy(object_vertices(scene)).float().expand(24, -1, -1)
+        pixels, depth = project(points, cameras)
+        assert (depth > 0).all()
+        assert pixels.min() >= 0
+        assert pixels.max() <= 64
+
+
+def test_a_scene_follows_from_its_number_alone():
+    def picture(index, seed):
+        scene = build_scene("cup", index, seed)
+        return render(scene, handheld_orbit(scene, 4, 24, seed=3)[1])
+
+    first, again = picture(2, 0), picture(2, 0)
+    assert torch.equal(first.image, again.image)
+    assert torch.equal(first.depth, again.depth)
+    assert not torch.equal(first.image, picture(3, 0).image)
+    assert not torch.equal(first.image, picture(2, 1).image)
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_objects_of_a_category_differ_in_shape_and_colour(category):
+    scenes = [build_scene(category, index, seed=0) for index in range(6)]
+    assert len({scene.radius for scene in scenes}) == 6
+    colors = []
+    for scene in scenes:
+        view = render(scene, handheld_orbit(scene, 1, 32, seed=0)[0], supersample=1)
+        colors.append(view.image[:, view.mask > 0].mean(1))
+    assert torch.pdist(torch.stack(colors)).max() > 0.1
+
+
+def test_an_unknown_category_is_answered_with_the_known_ones():
+    with pytest.raises(InputError, match="no synthetic category 'toaster'; there are apple, book"):
+        build_scene("toaster", 0, 0)
+
+
+def test_surface_points_lie_on_what_cameras_see():
+    scene = build_scene("hydrant", 1, seed=0)
+    cloud = surface_points(scene, 2000)
+    assert cloud.points.shape == cloud.colors.shape == (2000, 3)
+    assert cloud.colors.min() >= 0
+    assert cloud.colors.max() <= 1
+    camera = handheld_orbit(scene, 8, 128, seed=0)[3]
+    view = render(scene, camera, supersample=1)
+    pixels, depth = project(torch.from_numpy(cloud.points).float(), camera)
+    inside = ((pixels > 0) & (pixels < 128)).all(1) & (depth > 0)
+    column, row = pixels[inside].long().T
+    behind = depth[inside] - view.depth[row, column]
+    assert (behind > -0.03).float().mean() > 0.98  # no point floats in front of a surface
+    assert (behind.abs() < 0.03).float().mean() > 0.5

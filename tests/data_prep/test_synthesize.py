@@ -1,0 +1,103 @@
+"""Synthetic sequences on disk."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from data_prep.gallery import gallery
+from data_prep.synthesize import synthesize, walk_seed
+from extrap_train.config import SyntheticConfig
+from extrap_train.data.co3d import read_category
+from extrap_train.data.synthetic import build_scene, handheld_orbit, render
+from extrap_train.errors import InputError
+
+SMALL = SyntheticConfig(test_sequences=1, train_sequences=2, frames=3, image_size=16)
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(root)): p.read_bytes() for p in root.rglob("*") if p.is_file()}
+
+
+def times(root: Path, name: str) -> dict[str, int]:
+    return {p.name: p.stat().st_mtime_ns for p in (root / "apple" / name / "images").iterdir()}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("synthetic")
+    synthesize(SMALL, "apple", root, workers=1)
+    return root
+
+
+@pytest.fixture
+def root(made, tmp_path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "data"))
+
+
+def test_the_reader_finds_what_was_rendered(made):
+    sequences = read_category(made, "apple")
+    assert [sequence.name for sequence in sequences] == ["0000", "0001", "0002"]
+    scene = build_scene("apple", 1, SMALL.seed)
+    cameras = handheld_orbit(scene, 3, 16, walk_seed("apple", 1, SMALL.seed))
+    expected, view = render(scene, cameras[2]), sequences[1].frames[2].load()
+    torch.testing.assert_close(view.camera.world_to_cam, expected.camera.world_to_cam)
+    torch.testing.assert_close(view.camera.intrinsics, expected.camera.intrinsics)
+    torch.testing.assert_close(view.depth, expected.depth, rtol=1e-3, atol=0)
+    assert torch.equal(view.mask, expected.mask)
+    assert (view.image - expected.image).abs().mean() < 0.03  # a JPEG
+    assert sequences[1].point_cloud is not None
+
+
+def test_the_same_files_for_any_number_of_workers(made, tmp_path):
+    synthesize(SMALL, "apple", tmp_path, workers=2)
+    assert contents(tmp_path) == contents(made)
+
+
+def test_only_what_is_missing_is_rendered(root, made, capsys):
+    before = times(root, "0000")
+    shutil.rmtree(root / "apple" / "0001")
+    synthesize(SMALL, "apple", root, workers=1)
+    assert times(root, "0000") == before
+    assert contents(root) == contents(made)
+    assert "2 of 3 sequences are there already" in capsys.readouterr().out
+
+
+def test_what_a_killed_run_left_behind_is_made_anew(root, made):
+    (root / "apple" / "0002" / "synthetic.json").unlink()
+    synthesize(SMALL, "apple", root, workers=1)
+    assert contents(root) == contents(made)
+
+
+def test_more_training_sequences_keep_the_test_sequences(root):
+    before = times(root, "0000")
+    synthesize(replace(SMALL, train_sequences=3), "apple", root, workers=1)
+    assert times(root, "0000") == before
+    assert len(read_category(root, "apple")) == 4
+
+
+def test_other_options_replace_the_sequences_and_say_so(root, capsys):
+    synthesize(replace(SMALL, frames=2), "apple", root, workers=1)
+    assert "3 sequences were made with other options" in capsys.readouterr().out
+    assert [len(sequence.frames) for sequence in read_category(root, "apple")] == [2, 2, 2]
+
+
+def test_an_unknown_category_leaves_nothing_behind(tmp_path):
+    with pytest.raises(InputError, match="no synthetic category"):
+        synthesize(SMALL, "toaster", tmp_path, workers=1)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_one_line(tmp_path):
+    (tmp_path / "apple").write_text("a file where a folder belongs")
+    with pytest.raises(InputError, match="cannot be written"):
+        synthesize(SMALL, "apple", tmp_path, workers=1)
+
+
+def test_the_gallery_has_a_row_for_each_category():
+    picture = gallery(sequences=1, views=2, image_size=8)
+    assert picture.shape == (3, 48, 16)
+    assert np.isfinite(picture.numpy()).all()
