@@ -19,7 +19,7 @@ from extrap_train.data.co3d_writer import write_annotations, write_frame, write_
 from extrap_train.data.files import write_whole
 from extrap_train.data.synthetic import build_scene, handheld_orbit, render, surface_points
 
-LOOK = 1
+LOOK = 2
 """Raised whenever the same options give other pictures, so that old ones are not mixed with new."""
 RECORD = "synthetic.json"
 """In a sequence's folder: the options it was made with, and its annotations."""

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from extrap_train.data.synthetic.shapes import Mesh
 
 _DIRECTIONS = 40
-_EXPOSURE = 1.45
+_EXPOSURE = 1.3
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,7 @@ def sweep(
         np.concatenate([np.repeat(x[:1], 3, 0), x, np.repeat(x[-1:], 3, 0)]) for x in (side, up)
     )
     angles = np.linspace(0, 2 * np.pi, segments, endpoint=False)[:, None]
-    ring = side[:, None] * np.cos(angles) * flatten + up[:, None] * np.sin(angles)
+    ring = side[:, None] * np.cos(angles) * flatten - up[:, None] * np.sin(angles)
     vertices = path[:, None] + radii[:, None, None] * ring
     return _grid_mesh(vertices, np.arange(len(path) - 1), closed=True)
 
@@ -166,7 +166,7 @@ def sheet(points: Float[np.ndarray, "r c 3"]) -> Mesh:
 def flat_ground(half: tuple[Real, Real], lines: int = 44) -> Mesh:
     """A rectangle in the plane z = 0, finely divided near its centre to carry soft shading."""
     spread = np.sinh(np.linspace(-3.2, 3.2, lines)) / np.sinh(3.2)
-    x, y = np.meshgrid(spread * half[0], spread * half[1], indexing="ij")
+    x, y = np.meshgrid(spread * half[0], spread * half[1], indexing="xy")
     return sheet(np.stack([x, y, np.zeros_like(x)], -1))
 
 
