@@ -8,10 +8,14 @@ from extrap_train.config import DataPrepConfig
 
 
 def _run(config: DataPrepConfig) -> None:
+    # Heavy imports wait until the options are known to be right.
+    from rich.console import Console
+
+    from data_prep.report import write_report
     from extrap_train.tasks.prepare import prepare_category
 
     for member in config.category.members:
-        prepare_category(
+        prepared = prepare_category(
             member,
             config.data,
             config.depth,
@@ -19,6 +23,7 @@ def _run(config: DataPrepConfig) -> None:
             output=Path(config.output),
             workers=config.workers or os.cpu_count() or 1,
         )
+        write_report(prepared, Console())
 
 
 def main() -> None:

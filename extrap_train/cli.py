@@ -1,10 +1,13 @@
-"""The command line of every Hydra entry point: typed configuration in, one clear line out when it is wrong."""
+"""The command line of every Hydra entry point: typed configuration in, one clear line out when it
+is wrong.
+"""
 
 import difflib
 import os
 import re
 import sys
 from collections.abc import Callable
+from dataclasses import fields
 from typing import Any
 
 import hydra
@@ -39,8 +42,8 @@ def register_schemas() -> None:
 def command(name: str, run: Callable[[Any], None]) -> None:
     """Compose the configuration `conf/<name>.yaml` with the command line's overrides and run it.
 
-    An option that does not exist, a value of the wrong type, an unknown category and unusable input end
-    with one line on stderr and exit status 1.
+    An option that does not exist, a value of the wrong type, an unknown category and unusable input
+    end with one line on stderr and exit status 1.
     """
     register_schemas()
 
@@ -65,13 +68,13 @@ def typed_config(config: DictConfig) -> Any:
     missing = sorted(str(key) for key in OmegaConf.missing_keys(config) if key != "hydra")
     if missing:
         raise InputError(f"an option has no value: give {missing[0]}=VALUE")
-    typed = OmegaConf.to_object(config)
+    typed: Any = OmegaConf.to_object(config)
     schema.validate(typed, TASKS)
     return typed
 
 
 def _check(name: str, arguments: list[str]) -> None:
-    """Compose once before Hydra does, so that its errors can be said in one line with a suggestion."""
+    """Compose once before Hydra does, so that its errors fit one line with a suggestion."""
     overrides = [a for a in arguments if "=" in a and not a.startswith("-")]
     if {"--help", "-h"} & set(arguments):
         if not any(o.startswith(("category=", "experiment=")) for o in overrides):
@@ -88,7 +91,9 @@ def _check(name: str, arguments: list[str]) -> None:
 
 def _one_line(error: Exception, overrides: list[str]) -> str:
     text = " ".join(f"{error} {error.__cause__ or ''}".split())
-    group = re.search(r"Could not find '(\w+)/([^']+)' Available options in '\w+': (.*?)(?= Config)", text)
+    group = re.search(
+        r"Could not find '(\w+)/([^']+)' Available options in '\w+': (.*?)(?= Config)", text
+    )
     if group:
         kind, value, known = group.groups()
         names = [n for n in known.split() if not n.endswith("_schema")]
@@ -97,7 +102,9 @@ def _one_line(error: Exception, overrides: list[str]) -> str:
     if required:
         names = [n for n in required[2].split() if not n.endswith("_schema")]
         return f"{required[1]} is not given: {required[1]}={'|'.join(names)}"
-    unknown = re.search(r"Key '(\w+)' (?:is )?not in", text) or re.search(r"Could not override '([\w.]+)'", text)
+    unknown = re.search(r"Key '(\w+)' (?:is )?not in", text) or re.search(
+        r"Could not override '([\w.]+)'", text
+    )
     if unknown:
         keys = [o.partition("=")[0].lstrip("+~") for o in overrides]
         given = next((key for key in keys if key.endswith(unknown[1])), unknown[1])
@@ -106,11 +113,10 @@ def _one_line(error: Exception, overrides: list[str]) -> str:
 
 
 def _known_options() -> list[str]:
-    tree = OmegaConf.to_container(OmegaConf.structured(schema.TrainConfig))
-    groups = {group: variants for group, variants in _GROUPS.items()}
-    assert isinstance(tree, dict)
-    names = [f"{g}.{f}" for g, vs in groups.items() for v in vs for f in v.__dataclass_fields__]
-    return [*schema.dotted(tree), *names, *groups]
+    tree: Any = OmegaConf.to_container(OmegaConf.structured(schema.TrainConfig))
+    variants = [(group, variant) for group, all_ in _GROUPS.items() for variant in all_]
+    names = [f"{group}.{field.name}" for group, variant in variants for field in fields(variant)]
+    return [*schema.dotted(tree), *names, *_GROUPS]
 
 
 def _suggest(given: str, known: list[str]) -> str:

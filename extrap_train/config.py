@@ -1,7 +1,7 @@
 """The configuration tree as plain dataclasses: every option, its type, its unit and its bounds.
 
-Light on purpose (no torch), so that `--help` is instant. YAMLs under `conf/` choose among the variants of a group;
-this file says what may stand in them.
+Light on purpose (no torch), so that `--help` is instant. YAMLs under `conf/` choose among the
+variants of a group; this file says what may stand in them.
 """
 
 from dataclasses import dataclass, field
@@ -38,7 +38,7 @@ class SyntheticConfig(DataConfig):
 
     name: str = "synthetic"
     test_sequences: int = 5
-    """Sequences 0 … n−1 are for testing, whatever else is asked for."""
+    """Sequences 0 … n-1 are for testing, whatever else is asked for."""
     train_sequences: int = 40
     frames: int = 24
     """Photographs around each scene."""
@@ -53,7 +53,7 @@ class Co3dConfig(DataConfig):
 
     name: str = "co3d"
     test_sequences: int = 5
-    """Held out, drawn by a hash of the sequence's name; a lone sequence holds out frames instead."""
+    """Drawn by a hash of the sequence's name; a lone sequence holds out frames instead."""
 
 
 @dataclass
@@ -102,7 +102,9 @@ class PrepConfig:
     near_duplicate_deg: float = 6.0
     """A pair is skipped if a chosen one has both its frames within this angle of its own."""
     full_circle: str = "prefer"
-    """`require` drops what is no full circle, `prefer` does unless nothing is one, `ignore` keeps it."""
+    """`require` drops what is no full circle, `prefer` does unless nothing is one, `ignore` keeps
+    it.
+    """
 
 
 @dataclass
@@ -138,7 +140,9 @@ class ModelConfig:
     learning_rate: float = 3e-4
     weight_decay: float = 0.01
     start: str | None = None
-    """Folder of the model that training starts from; `base` is the one in the package; null is random."""
+    """Folder of the model that training starts from; `base` is the one in the package; null is
+    random.
+    """
 
 
 @dataclass
@@ -197,7 +201,9 @@ class TrainConfig:
     task: str = "category"
     seed: int = 0
     run: str | None = None
-    """Name of the run's folder; by default made from the configuration, so that the same command resumes."""
+    """Name of the run's folder; by default made from the configuration, so that the same command
+    resumes.
+    """
     resume: bool = True
     output: str = "outputs"
     threads: int | None = None
@@ -230,14 +236,16 @@ def dotted(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def validate(config: TrainConfig | DataPrepConfig, tasks: tuple[str, ...]) -> None:
-    """Check what types cannot say; raises InputError naming the option, its value and the remedy."""
+    """Check what types cannot say; raises InputError with option, value and remedy."""
     _check_prep(config.prep)
     if isinstance(config.data, Co3dConfig) and not config.data.root:
         raise InputError("data=co3d needs the folder of the download: give data.root=FOLDER")
     if isinstance(config, TrainConfig):
         _check_one_of("task", config.task, tasks)
         _check_model(config.model, config.prep)
-        _check_positive("trainer", config.trainer, ("steps", "batch_size", "checkpoint_every", "validate_every"))
+        _check_positive(
+            "trainer", config.trainer, ("steps", "batch_size", "checkpoint_every", "validate_every")
+        )
         _check_positive("sampler", config.sampler, ("steps",))
         _check_positive("validation", config.validation, ("examples", "batch_size", "pictures"))
 
@@ -256,19 +264,21 @@ def _check_model(model: ModelConfig, prep: PrepConfig) -> None:
     _check_one_of("model.prediction", model.prediction, ("epsilon", "v_prediction", "sample"))
     if model.image_size != prep.image_size:
         raise InputError(
-            f"model.image_size={model.image_size} but prep.image_size={prep.image_size}: give both the same"
+            f"model.image_size={model.image_size} but "
+            f"prep.image_size={prep.image_size}: give both the same"
         )
     coarsest = model.patch * 2 ** (len(model.unet.channels) - 1)
     if model.image_size % coarsest:
         raise InputError(
-            f"model.image_size={model.image_size} is no multiple of {coarsest}, which model.patch and the "
-            "levels of model.unet.channels need"
+            f"model.image_size={model.image_size} is no multiple of {coarsest}, "
+            "which model.patch and the levels of model.unet.channels need"
         )
     if len(model.unet.channels) != len(model.unet.attention_levels):
         raise InputError("model.unet.channels and model.unet.attention_levels differ in length")
     if model.zero_terminal_snr and model.prediction == "epsilon":
         raise InputError(
-            "model.prediction=epsilon says nothing at zero terminal SNR: give model.zero_terminal_snr=false"
+            "model.prediction=epsilon says nothing at zero terminal SNR: "
+            "give model.zero_terminal_snr=false"
         )
 
 

@@ -1,4 +1,6 @@
-"""Image metrics with declared ranges: every image is float in [0, 1], `b 3 h w`; results are one number an image."""
+"""Image metrics with declared ranges: every image is float in [0, 1], `b 3 h w`; results are one
+number an image.
+"""
 
 import pickle
 from collections.abc import Callable
@@ -25,7 +27,7 @@ def psnr(
     truth: Float[Tensor, "b 3 h w"],
     mask: Float[Tensor, "b h w"] | None = None,
 ) -> Float[Tensor, " b"]:
-    """Peak signal-to-noise ratio in dB, over the pixels where `mask` is 1; NaN where there is none."""
+    """Peak signal-to-noise ratio in dB, over the pixels where `mask` is 1; NaN if none."""
     error = (prediction - truth).square().mean(1)
     weight = torch.ones_like(error) if mask is None else mask
     mean = (error * weight).sum((-2, -1)) / weight.sum((-2, -1))
@@ -61,16 +63,16 @@ def squeeze_lpips(
 ) -> Callable[[Float[Tensor, "b 3 h w"], Float[Tensor, "b 3 h w"]], Float[Tensor, " b"]]:
     """LPIPS with the squeeze backbone, for images in [0, 1].
 
-    `weights` is a full state dict; without it the backbone must lie in torch's hub cache. Raises InputError
-    where neither is there: another network's number is never put in its place.
+    `weights` is a full state dict; without it the backbone must lie in torch's hub cache. Raises
+    InputError where neither is there: another network's number is never put in its place.
     """
     import lpips  # takes a second: only where the metric is wanted
 
     cached = Path(torch.hub.get_dir()) / "checkpoints" / _SQUEEZENET
     if weights is None and not cached.is_file():
         raise InputError(
-            f"LPIPS (squeeze) has no weights: give validation.lpips_weights=FILE or put {_SQUEEZENET} "
-            "into torch's hub cache"
+            "LPIPS (squeeze) has no weights: give validation.lpips_weights=FILE or put "
+            f"{_SQUEEZENET} into torch's hub cache"
         )
     network = lpips.LPIPS(net="squeeze", pnet_rand=weights is not None, verbose=False).eval()
     if weights is not None:

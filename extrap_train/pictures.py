@@ -21,7 +21,9 @@ def colour_depth(depth: Float[Tensor, "b h w"]) -> Float[Tensor, "b 3 h w"]:
     pictures = []
     for one in depth:
         known = one > 0
-        low, high = one[known].quantile(torch.tensor([0.02, 0.98]).to(one)) if known.any() else (0, 1)
+        low, high = (
+            one[known].quantile(torch.tensor([0.02, 0.98]).to(one)) if known.any() else (0, 1)
+        )
         near = 1 - ((one - low) / max(float(high - low), 1e-12)).clamp(0, 1)
         colours = torch.from_numpy(plt.get_cmap("viridis")(near.cpu().numpy())[..., :3])
         pictures.append(torch.where(known[..., None].cpu(), colours, 0.0).permute(2, 0, 1).float())

@@ -1,4 +1,4 @@
-"""The folder of a training run: its name, what it was started with, and whether it may be resumed."""
+"""The folder of a training run: its name, its options, and whether it may be resumed."""
 
 import hashlib
 import json
@@ -16,8 +16,18 @@ from extrap_train.config import TrainConfig, dotted
 from extrap_train.data.files import write_whole
 from extrap_train.errors import InputError
 
-_NOT_PART_OF_THE_RUN = ("output", "run", "resume", "threads", "validation", "data.root", "trainer.steps")
-"""Keys that may differ on resume: where things lie, how they are measured, and a longer training."""
+_NOT_PART_OF_THE_RUN = (
+    "output",
+    "run",
+    "resume",
+    "threads",
+    "validation",
+    "data.root",
+    "trainer.steps",
+)
+"""Keys that may differ on resume: where things lie, how they are measured, and a longer training.
+
+"""
 
 _PACKAGES = ("torch", "lightning", "diffusers", "numba", "numpy", "extrap-train")
 
@@ -79,7 +89,9 @@ def _check_same(saved: Path, identity: dict[str, Any]) -> None:
     try:
         before = dotted(yaml.safe_load(saved.read_text()))
     except (yaml.YAMLError, AttributeError) as error:
-        raise InputError(f"{saved}: unreadable ({error}); remove the run or choose run=NAME") from None
+        raise InputError(
+            f"{saved}: unreadable ({error}); remove the run or choose run=NAME"
+        ) from None
     changed = [
         f"{key} (was {before.get(key)}, now {value})"
         for key, value in identity.items()

@@ -1,12 +1,32 @@
-"""The nouns that travel: cameras, views, and what a batch is made of. Conventions: `extrap_train.geometry`."""
+"""The nouns that travel: cameras, views, and what a batch is made of. Conventions:
+`extrap_train.geometry`.
+"""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, TypeVar, cast
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
+
+T = TypeVar("T")
+
+
+def combine(parts: Sequence[T], join: Callable[[Sequence[Tensor]], Tensor]) -> T:
+    """One value from several alike: tensors, in dataclasses of any depth, are joined.
+
+    Whatever is no tensor is taken from the first.
+    """
+    first: Any = parts[0]
+    if isinstance(first, Tensor):
+        return cast(T, join(cast(Sequence[Tensor], parts)))
+    if not is_dataclass(first) or isinstance(first, type):
+        return cast(T, first)
+    names = [field.name for field in fields(first)]
+    joined = {name: combine([getattr(part, name) for part in parts], join) for name in names}
+    return cast(T, replace(first, **joined))
 
 
 @dataclass(frozen=True)
@@ -50,9 +70,7 @@ class Camera:
 
     def to(self, device: torch.device | str) -> "Camera":
         """The same camera on another device."""
-        return replace(
-            self, world_to_cam=self.world_to_cam.to(device), intrinsics=self.intrinsics.to(device)
-        )
+        return combine([self], lambda tensors: tensors[0].to(device))
 
     def __getitem__(self, index: int | slice | tuple[int | slice, ...] | Tensor) -> "Camera":
         """Index the leading dimensions."""
@@ -66,11 +84,7 @@ def stack_cameras(cameras: Sequence[Camera]) -> Camera:
     sizes = {(camera.height, camera.width) for camera in cameras}
     if len(sizes) != 1:
         raise ValueError(f"cameras of different image sizes cannot be stacked: {sorted(sizes)}")
-    return replace(
-        cameras[0],
-        world_to_cam=torch.stack([camera.world_to_cam for camera in cameras]),
-        intrinsics=torch.stack([camera.intrinsics for camera in cameras]),
-    )
+    return combine(cameras, lambda tensors: torch.stack(list(tensors)))
 
 
 @dataclass(frozen=True)
@@ -85,11 +99,13 @@ class View:
 
     def cropped(self, top: int, left: int, height: int, width: int) -> "View":
         """The view's crop; the window must lie inside the image."""
-        inside = 0 <= top and 0 <= left
-        if not (inside and top + height <= self.camera.height and left + width <= self.camera.width):
+        inside = top >= 0 and left >= 0
+        if not (
+            inside and top + height <= self.camera.height and left + width <= self.camera.width
+        ):
             raise ValueError(
-                f"crop {height}×{width} at ({top}, {left}) leaves the "
-                f"{self.camera.height}×{self.camera.width} image"
+                f"crop {height} x {width} at ({top}, {left}) leaves the "
+                f"{self.camera.height} x {self.camera.width} image"
             )
         window = (..., slice(top, top + height), slice(left, left + width))
         return replace(
@@ -101,14 +117,16 @@ class View:
         )
 
     def resized(self, height: int, width: int) -> "View":
-        """The view resampled: colours and mask by area, depth by nearest pixel (edges stay edges)."""
+        """The view resampled: colours and mask by area, depth by the nearest pixel."""
         size = (height, width)
         return replace(
             self,
             image=_resample_area(self.image, size).clamp(0, 1),
             camera=self.camera.resized(height, width),
             depth=None if self.depth is None else _resample_nearest(self.depth[None], size)[0],
-            mask=None if self.mask is None else _resample_area(self.mask[None], size)[0].clamp(0, 1),
+            mask=None
+            if self.mask is None
+            else _resample_area(self.mask[None], size)[0].clamp(0, 1),
         )
 
     def squared(self, size: int) -> "View":
@@ -144,7 +162,7 @@ class ViewPair:
 
 @dataclass(frozen=True)
 class Warp:
-    """What the references show of the query view (paper II-A). Zero, never by accident, where `mask` is 0."""
+    """What the references show of the query view (paper II-A); zero where `mask` is 0."""
 
     image: Float[Tensor, "b 3 h w"]
     coordinates: Float[Tensor, "b 2 h w"]
@@ -160,7 +178,7 @@ class Warp:
 
 @dataclass(frozen=True)
 class PairBatch:
-    """A batch of examples: target view, up to `k` references (nearest first), and the warp between them."""
+    """Examples: target view, up to `k` references (nearest first), and the warp between them."""
 
     image: Float[Tensor, "b 3 h w"]
     camera: Camera
@@ -174,10 +192,4 @@ class PairBatch:
 
     def to(self, device: torch.device | str) -> "PairBatch":
         """The same batch on another device."""
-        moved = {
-            name: value.to(device)
-            for name, value in vars(self).items()
-            if isinstance(value, Tensor | Camera)
-        }
-        warp = self.warp and Warp(**{name: x.to(device) for name, x in vars(self.warp).items()})
-        return replace(self, **moved, warp=warp)
+        return combine([self], lambda tensors: tensors[0].to(device))

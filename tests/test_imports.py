@@ -1,4 +1,6 @@
-"""Imports point one way: geometry and views know nothing of depth and data, and those nothing of diffusion."""
+"""Imports point one way: geometry and views know nothing of depth and data, and those nothing of
+diffusion.
+"""
 
 import ast
 from pathlib import Path

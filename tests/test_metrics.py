@@ -67,8 +67,8 @@ def test_missing_lpips_weights_are_named(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     with pytest.raises(InputError, match=r"validation\.lpips_weights"):
         squeeze_lpips(None)
-    with pytest.raises(InputError, match="no.pt"):
+    with pytest.raises(InputError, match=r"no\.pt"):
         squeeze_lpips(str(tmp_path / "no.pt"))
     (tmp_path / "bad.pt").write_bytes(b"nothing")
-    with pytest.raises(InputError, match="bad.pt"):
+    with pytest.raises(InputError, match=r"bad\.pt"):
         squeeze_lpips(str(tmp_path / "bad.pt"))

@@ -33,7 +33,8 @@ def with_warp(batch: PairBatch) -> PairBatch:
 class PositionSampler(Sampler[Positions]):
     """Batches of one epoch from an endless stream of shuffled passes over the pairs.
 
-    Nothing is remembered: epoch `e` of a run that was killed is the epoch `e` that it would have been.
+    Nothing is remembered: epoch `e` of a run that was killed is the epoch `e` that it would have
+    been.
     """
 
     def __init__(

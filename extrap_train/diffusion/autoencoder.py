@@ -27,8 +27,8 @@ class Autoencoder(Protocol):
 class PixelPatches:
     """Square patches of pixels as channels: exact both ways.
 
-    The gain brings natural images (spread about 0.25 around mid-grey) to the unit spread that the noise
-    schedule is made for.
+    The gain brings natural images (spread about 0.25 around mid-grey) to the unit spread that the
+    noise schedule is made for.
     """
 
     gain = 4.0

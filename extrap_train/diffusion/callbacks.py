@@ -1,4 +1,6 @@
-"""How a run survives: whole checkpoints, a metrics table that knows its step, averaged weights, a progress bar."""
+"""How a run survives: whole checkpoints, a metrics table that knows its step, averaged weights, a
+progress bar.
+"""
 
 import csv
 import io
@@ -53,8 +55,8 @@ class WholeCheckpointIO(TorchCheckpointIO):
 class EpochCheckpoints(Callback):
     """Saves at the end of every epoch and keeps the newest two.
 
-    Epochs are as long as the distance between checkpoints, so that a resumed run starts at the first batch
-    of an epoch and sees exactly the batches that it would have seen.
+    Epochs are as long as the distance between checkpoints, so that a resumed run starts at the
+    first batch of an epoch and sees exactly the batches that it would have seen.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -74,7 +76,7 @@ def checkpoints(folder: Path) -> list[Path]:
 
 
 class AveragedWeights(WeightAveraging):
-    """Exponential moving average whose memory grows with the run: decay min(d, (1 + n)/(10 + n))."""
+    """Exponential moving average with a growing memory: decay min(d, (1 + n)/(10 + n))."""
 
     def __init__(self, decay: float) -> None:
         def average(mean: Tensor, value: Tensor, count: Tensor | int) -> Tensor:
@@ -82,6 +84,12 @@ class AveragedWeights(WeightAveraging):
             return mean.lerp(value, 1 - min(decay, ramp))
 
         super().__init__(avg_fn=average)
+
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Hand out the average also where a resumed run had no step left, which skips
+        `on_train_end`.
+        """
+        self._copy_average_to_current(pl_module)
 
 
 class MetricsTable(Logger):
@@ -161,8 +169,8 @@ class StepProgress(Callback):
         loss = float(trainer.callback_metrics["loss"])
         if not loss == loss:
             raise InputError(
-                f"the loss is not a number at step {trainer.global_step}: lower model.learning_rate "
-                "or set trainer.precision=32-true, then start again from the last checkpoint"
+                f"the loss is not a number at step {trainer.global_step}: lower "
+                "model.learning_rate or set trainer.precision=32-true under another run=NAME"
             )
         note = f"loss {loss:.4f}"
         above = trainer.callback_metrics.get("validation/above_baselines_db")

@@ -25,7 +25,8 @@ def packaged_weights(name: str) -> Path:
     if not (folder / name / _CONFIG).is_file():
         known = sorted(path.parent.name for path in folder.glob(f"*/{_CONFIG}"))
         raise InputError(
-            f"model.start={name} is neither a model folder nor one of the package's: {', '.join(known)}"
+            f"model.start={name} is neither a model folder nor one of the package's: "
+            f"{', '.join(known)}"
         )
     return folder / name
 
@@ -78,14 +79,16 @@ def load_weights(model: ExtrapolationModel, folder: Path) -> None:
         try:
             getattr(model, part).load_state_dict(load_file(path))
         except (OSError, SafetensorError) as error:
-            raise InputError(f"{path}: cannot be read ({error}); restore the model folder") from None
+            raise InputError(
+                f"{path}: cannot be read ({error}); restore the model folder"
+            ) from None
         except RuntimeError as error:
             reason = " ".join(str(error).split())[:300]
             raise InputError(f"{path}: does not fit the configured model: {reason}") from None
 
 
 def start_weights(model: ExtrapolationModel, start: str | None) -> None:
-    """Fill a model with what training starts from: a folder, a packaged model's name, or nothing."""
+    """Fill a model with what training starts from: a folder, a packaged model, or nothing."""
     if start is not None:
         folder = Path(start)
         load_weights(model, folder if (folder / _CONFIG).is_file() else packaged_weights(start))

@@ -1,7 +1,9 @@
 """What the denoiser is told about the query view (METHOD section 3; paper II-B).
 
-Input channels, in order: `noisy latent | reference latent | warped-image latent | PE(reference) | PE(warped) | mask`,
-all at the latents' resolution, and one cross-attention token from the reference's embedding and the relative pose.
+Input channels, in order: `noisy latent | reference latent | warped-image latent | PE(reference) |
+PE(warped) | mask`, all at the latents' resolution, and one cross-attention token from the
+reference's embedding and the
+relative pose.
 """
 
 from dataclasses import dataclass
@@ -14,7 +16,7 @@ from torch.nn import functional
 from extrap_train.diffusion.autoencoder import Autoencoder
 from extrap_train.geometry.encoding import coordinate_grid, positional_encoding
 from extrap_train.geometry.fill import fill_holes
-from extrap_train.views import PairBatch, Warp
+from extrap_train.views import PairBatch, Warp, combine
 
 
 @dataclass(frozen=True)
@@ -26,20 +28,23 @@ class Conditioning:
     embedding: Float[Tensor, "b d"]
     """Reference embedding and pose encoding, before their projection to the token."""
     base: Float[Tensor, "b z h w"]
-    """Latent that the denoised latent is added to: the filled warp, or zero. No part of the condition."""
+    """Latent that the denoised latent is added to: the filled warp, or zero. No part of the
+    condition.
+    """
 
     def zeroed(self, where: Bool[Tensor, " b"]) -> "Conditioning":
         """The null condition, the same in training and in sampling, for the chosen examples."""
         keep = (~where).to(self.latents.dtype)
-        return type(self)(
+        return Conditioning(
             self.latents * keep[:, None, None, None], self.embedding * keep[:, None], self.base
         )
 
     def doubled(self) -> "Conditioning":
         """Condition and null condition stacked along the batch, for guidance in one pass."""
-        null = self.zeroed(torch.ones(len(self.latents), dtype=torch.bool, device=self.latents.device))
-        pairs = zip(vars(self).values(), vars(null).values(), strict=True)
-        return type(self)(*(torch.cat(pair) for pair in pairs))
+        null = self.zeroed(
+            torch.ones(len(self.latents), dtype=torch.bool, device=self.latents.device)
+        )
+        return combine([self, null], lambda tensors: torch.cat(list(tensors)))
 
 
 def condition_channels(latent_channels: int, octaves: int) -> int:
@@ -73,7 +78,9 @@ def concatenated_latents(
 
 
 def _encode_warped(warp: Warp, octaves: int, factor: int) -> Float[Tensor, "b c h w"]:
-    """Encoding of the warped coordinates: averaged over each latent's known pixels first, zero in holes."""
+    """Encoding of the warped coordinates: averaged over each latent's known pixels first, zero in
+    holes.
+    """
     known = warp.nearest_mask[:, None]
     share = functional.avg_pool2d(known, factor)
     coordinates = functional.avg_pool2d(warp.coordinates * known, factor) / share.clamp_min(1e-6)

@@ -1,7 +1,7 @@
 """Scores of a model and of the baselines on the same held-out examples."""
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import pandas as pd
 import torch
@@ -13,7 +13,7 @@ from extrap_train.diffusion.baselines import inpainted_warp, mean_filled_warp, n
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sample_views, view_generator
 from extrap_train.metrics import psnr, quantised, ssim
-from extrap_train.views import PairBatch
+from extrap_train.views import PairBatch, combine
 
 Distance = Callable[[Tensor, Tensor], Tensor]
 
@@ -46,15 +46,19 @@ def predict(
     """The model's sample and the baselines for every batch; one seed per view, by its name."""
     for batch, names in batches:
         generators = [view_generator(seed, name) for name in names]
-        images = {"model": sample_views(model, batch, sampler, generators), **baseline_images(batch)}
+        images = {
+            "model": sample_views(model, batch, sampler, generators),
+            **baseline_images(batch),
+        }
         yield Prediction(batch, names, images)
 
 
 def score(prediction: Prediction, lpips: Distance | None) -> pd.DataFrame:
-    """A row per view and method: psnr, psnr_holes, psnr_warped (dB), ssim, and lpips where it can be had.
+    """A row per view and method: psnr, psnr_holes, psnr_warped (dB), ssim, and lpips where it can
+    be had.
 
-    Images and truth go through 8 bits first. `psnr_holes` is over the pixels that no reference reaches,
-    `psnr_warped` over the others; NaN where a view has none.
+    Images and truth go through 8 bits first. `psnr_holes` is over the pixels that no reference
+    reaches, `psnr_warped` over the others; NaN where a view has none.
     """
     assert prediction.batch.warp is not None
     truth = quantised(prediction.batch.image)
@@ -70,7 +74,9 @@ def score(prediction: Prediction, lpips: Distance | None) -> pd.DataFrame:
         }
         if lpips is not None:
             columns["lpips"] = lpips(made, truth)
-        table = pd.DataFrame({name: values.cpu().double().numpy() for name, values in columns.items()})
+        table = pd.DataFrame(
+            {name: values.cpu().double().numpy() for name, values in columns.items()}
+        )
         tables.append(table.assign(method=method, view=prediction.names))
     return pd.concat(tables, ignore_index=True)
 
@@ -93,28 +99,10 @@ def first_views(predictions: list[Prediction], count: int) -> Prediction:
     chosen = torch.linspace(0, total - 1, min(count, total)).round().long()
     names = [name for p in predictions for name in p.names]
     return Prediction(
-        _joined([p.batch for p in predictions], chosen),
+        combine([p.batch for p in predictions], lambda tensors: torch.cat(list(tensors))[chosen]),
         [names[i] for i in chosen.tolist()],
         {
             method: torch.cat([p.images[method] for p in predictions])[chosen]
             for method in predictions[0].images
         },
     )
-
-
-def _joined(batches: list[PairBatch], chosen: Tensor) -> PairBatch:
-    first = batches[0]
-    tensors = {
-        name: torch.cat([getattr(b, name) for b in batches])[chosen]
-        for name, value in vars(first).items()
-        if isinstance(value, Tensor)
-    }
-    assert first.warp is not None
-    warp = replace(
-        first.warp,
-        **{
-            name: torch.cat([getattr(b.warp, name) for b in batches])[chosen]
-            for name in vars(first.warp)
-        },
-    )
-    return replace(first, **tensors, warp=warp)

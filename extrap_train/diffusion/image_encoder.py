@@ -5,14 +5,18 @@ from torch import Tensor, nn
 
 
 class SmallImageEncoder(nn.Sequential):
-    """A few strided convolutions, trained with the denoiser; stands where the full size has CLIP."""
+    """A few strided convolutions, trained with the denoiser; the full size has CLIP here."""
 
     def __init__(self, width: int) -> None:
         layers: list[nn.Module] = []
         channels = 3
         for level in range(4):
             out = width // 2 ** (3 - level)
-            layers += [nn.Conv2d(channels, out, 3, stride=2, padding=1), nn.GroupNorm(4, out), nn.SiLU()]
+            layers += [
+                nn.Conv2d(channels, out, 3, stride=2, padding=1),
+                nn.GroupNorm(4, out),
+                nn.SiLU(),
+            ]
             channels = out
         super().__init__(*layers, nn.AdaptiveAvgPool2d(1), nn.Flatten())
         self.width = width

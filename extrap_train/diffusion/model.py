@@ -1,4 +1,6 @@
-"""The view-extrapolation model: everything between a batch of references and the denoiser's prediction."""
+"""The view-extrapolation model: everything between a batch of references and the denoiser's
+prediction.
+"""
 
 import torch
 from jaxtyping import Float, Int

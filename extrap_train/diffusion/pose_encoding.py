@@ -13,7 +13,9 @@ _LEAST_SCALE = 1e-2
 
 
 def depth_scale(depth: Float[Tensor, "b h w"]) -> Float[Tensor, " b"]:
-    """Scene scale of a reference: the 0.2 quantile of its known depth on every fourth pixel; 1 if none."""
+    """Scene scale of a reference: the 0.2 quantile of its known depth on every fourth pixel; 1 if
+    none.
+    """
     scales = []
     for sparse in depth[:, ::4, ::4]:
         known = sparse[sparse > 0]
@@ -26,9 +28,9 @@ def zeronvs_pose(
 ) -> Float[Tensor, "b 19"]:
     """Relative pose and field of view: 16 matrix entries row by row, then fov, sin fov, cos fov.
 
-    The matrix is inv(cam_to_world of the reference) @ cam_to_world of the query in OpenGL axes; its
-    translation, in units of the scene scale, is squashed to 0.5·10·tanh(t/10). The field of view is the
-    smaller of the query's two, in radians.
+    The matrix is inv(cam_to_world of the reference) @ cam_to_world of the query in OpenGL axes;
+    its translation, in units of the scene scale, is squashed to 0.5·10·tanh(t/10). The field of
+    view is the smaller of the query's two, in radians.
     """
     reference_to_world = opengl_from_world_to_cam(reference.world_to_cam)
     query_to_world = opengl_from_world_to_cam(query.world_to_cam)

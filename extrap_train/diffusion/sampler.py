@@ -15,7 +15,7 @@ from extrap_train.views import PairBatch
 
 
 def view_generator(seed: int, name: str) -> torch.Generator:
-    """The generator of one view: the same noise for the same view, whatever batch it is sampled in."""
+    """The generator of one view: the same noise, whatever batch the view is sampled in."""
     return torch.Generator().manual_seed(seed * 2**32 + zlib.crc32(name.encode()))
 
 

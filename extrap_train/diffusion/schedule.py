@@ -8,11 +8,13 @@ from extrap_train.config import ModelConfig
 def noise_schedule(config: ModelConfig) -> DDIMScheduler:
     """1000 steps, `scaled_linear` as in ZeroNVS (METHOD section 3).
 
-    With zero terminal SNR (Lin et al. 2023) the last step is pure noise, so sampling starts where training
-    ended ("trailing"); an ε-prediction says nothing there, which is why the combination is refused.
+    With zero terminal SNR (Lin et al. 2023) the last step is pure noise, so sampling starts where
+    training ended ("trailing"); an ε-prediction says nothing there, hence it is refused.
     """
     if config.zero_terminal_snr and config.prediction == "epsilon":
-        raise ValueError("zero terminal SNR needs model.prediction=v_prediction or sample, not epsilon")
+        raise ValueError(
+            "zero terminal SNR needs model.prediction=v_prediction or sample, not epsilon"
+        )
     return DDIMScheduler(
         num_train_timesteps=1000,
         beta_start=0.00085,

@@ -4,6 +4,7 @@ import lightning
 import pandas as pd
 import torch
 from jaxtyping import Float
+from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 from torch.nn import functional
 
@@ -30,7 +31,8 @@ def diffusion_loss(
 ) -> Float[Tensor, ""]:
     """Mean squared error of the prediction at one random noise level per example.
 
-    Every random number comes from the (CPU) generator, so that a step is a function of its seed alone.
+    Every random number comes from the (CPU) generator, so that a step is a function of its seed
+    alone.
     """
     conditioning = model.condition(batch)
     target = model.encode_target(batch.image, conditioning)
@@ -72,9 +74,7 @@ class CategoryTraining(lightning.LightningModule):
         generator = torch.Generator().manual_seed(
             (self.config.seed * 2**20 + self.global_step) * 64 + self.global_rank
         )
-        loss = diffusion_loss(
-            self.model, batch, generator, self.config.trainer.condition_dropout
-        )
+        loss = diffusion_loss(self.model, batch, generator, self.config.trainer.condition_dropout)
         self.log("loss", loss, prog_bar=True)
         return loss
 
@@ -101,7 +101,7 @@ class CategoryTraining(lightning.LightningModule):
         """The views of the last validation that are shown."""
         return first_views(self.predictions, self.config.validation.pictures)
 
-    def configure_optimizers(self) -> dict[str, object]:
+    def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         """AdamW with a linear warm-up to a constant rate, as MegaScenes trains."""
         model, trainer = self.config.model, self.config.trainer
         optimizer = torch.optim.AdamW(

@@ -7,7 +7,9 @@ from torch import Tensor
 from extrap_train.views import Camera
 
 
-def pixel_grid(height: int, width: int, device: torch.device | str = "cpu") -> Float[Tensor, "h w 2"]:
+def pixel_grid(
+    height: int, width: int, device: torch.device | str = "cpu"
+) -> Float[Tensor, "h w 2"]:
     """Pixel centres (u, v) of an image."""
     v, u = torch.meshgrid(
         torch.arange(height, device=device) + 0.5,
@@ -31,7 +33,9 @@ def unproject_to_world(depth: Float[Tensor, "*b h w"], camera: Camera) -> Float[
     return transform(camera.cam_to_world[..., None, :, :], unproject(depth, camera))
 
 
-def transform(matrix: Float[Tensor, "*#b 4 4"], points: Float[Tensor, "*b n 3"]) -> Float[Tensor, "*b n 3"]:
+def transform(
+    matrix: Float[Tensor, "*#b 4 4"], points: Float[Tensor, "*b n 3"]
+) -> Float[Tensor, "*b n 3"]:
     """Apply a rigid (or any affine) transform to points."""
     return points @ matrix[..., :3, :3].mT + matrix[..., None, :3, 3]
 

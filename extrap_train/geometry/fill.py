@@ -1,4 +1,6 @@
-"""Smooth completion of holes, so that a network never sees an arbitrary constant where nothing is known."""
+"""Smooth completion of holes, so that a network never sees an arbitrary constant where nothing is
+known.
+"""
 
 import torch
 from jaxtyping import Float
@@ -12,7 +14,8 @@ def fill_holes(
     """Fill where `mask` is 0 by pull-push (Gortler et al., The Lumigraph, 1996, section 3.4.1).
 
     Known pixels are averaged down a pyramid until no hole is left, then each hole takes the coarser
-    level's colour. Known pixels stay exactly as they are; an image without any known pixel becomes 0.
+    level's colour. Known pixels stay exactly as they are; an image without any known pixel becomes
+    0.
     """
     weight = mask[:, None].to(image.dtype)
     height, width = image.shape[-2:]

@@ -1,12 +1,14 @@
 """`task=category`, the main job: data, training, validation, and the files that a run leaves."""
 
 import json
+import logging
 import math
 import os
 import shutil
 import time
+import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import lightning
 import torch
@@ -40,6 +42,9 @@ from extrap_train.tasks.prepare import prepare_category
 def run(config: TrainConfig) -> None:
     """Train a category model and leave weights, metrics, pictures and `summary.json` behind."""
     console = Console()
+    _quieten_lightning()
+    distance, missing = _lpips(config)
+    model = _model(config)
     folder = open_run(config)
     if config.resume and _finished(folder, config.trainer.steps):
         console.print(f"already trained for {config.trainer.steps} steps: {folder.path}")
@@ -61,11 +66,11 @@ def run(config: TrainConfig) -> None:
     ]
     seconds = {"prepare": time.perf_counter() - started}
     readers = {
-        split: ExampleReader(prepared, split, config.model.references) for split in ("train", "test")
+        split: ExampleReader(prepared, split, config.model.references)
+        for split in ("train", "test")
     }
-    distance, missing = _lpips(config)
     data = _data_module(config, readers["train"], readers["test"])
-    training = CategoryTraining(_model(config), config, _names(data), distance)
+    training = CategoryTraining(model, config, _names(data), distance)
     started = time.perf_counter()
     trainer = _trainer(config, folder, training)
     trainer.fit(training, data, ckpt_path=_newest(folder), weights_only=True)
@@ -76,19 +81,27 @@ def run(config: TrainConfig) -> None:
     save_model(training.model, folder.model)
     training.scores().to_csv(folder.path / "validation.csv", index=False)
     draw(training.pictures(), folder.samples / "final.png")
+    validation = summarise(training.scores())
     summary = {
-        "validation": summarise(training.scores()),
+        "validation": validation,
         "missing": missing,
         "seconds": seconds,
         "steps": trainer.global_step,
         "parameters": sum(p.numel() for p in training.model.parameters()),
-        "provenance": provenance(config, {d.folder.name: d.content_hash for d in prepared}),
+        "provenance": provenance(config, {d.folder.name: d.manifest["key"] for d in prepared}),
     }
     write_whole(folder.summary, (json.dumps(_without_nan(summary), indent=1) + "\n").encode())
-    console.print(_table(summary["validation"]))
+    console.print(_table(validation))
     for name, reason in missing.items():
         console.print(f"missing {name}: {reason}")
     console.print(f"pictures: {folder.samples / 'final.png'}\nresult: {folder.path}")
+
+
+def _quieten_lightning() -> None:
+    """Its tips and device lists say nothing about the user's run."""
+    logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
+    warnings.filterwarnings("ignore", module="lightning")
+    warnings.filterwarnings("ignore", message=".*(weights|pretrained).*", module="torchvision")
 
 
 def _finished(folder: RunFolder, steps: int) -> bool:
@@ -170,7 +183,7 @@ def _trainer(
     return lightning.Trainer(
         accelerator=options.accelerator,
         devices=options.devices,
-        precision=options.precision,
+        precision=cast(Any, options.precision),
         max_steps=options.steps,
         max_epochs=-1,
         check_val_every_n_epoch=max(1, options.validate_every // epoch),

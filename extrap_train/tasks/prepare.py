@@ -1,9 +1,13 @@
-"""From a category's name to prepared pairs: synthesis where the data is synthetic, then reading and preparation."""
+"""From a category's name to prepared pairs: synthesis where the data is synthetic, then reading and
+preparation.
+"""
 
 import hashlib
 import json
 from dataclasses import asdict
 from pathlib import Path
+
+from filelock import FileLock
 
 from data_prep.build import prepare
 from data_prep.synthesize import synthesize
@@ -30,16 +34,19 @@ def prepare_category(
     workers: int,
 ) -> PreparedData:
     """Sequences of one category as pairs on disk; what is there already is used again."""
-    sequences, test_names = _sequences(category, data, output, workers)
     folder = output / "data" / f"{category}-{_digest(category, data, depth, prep)}"
-    return prepare(
-        sequences,
-        depth_source(depth),
-        prep,
-        test_names=test_names,
-        folder=folder,
-        workers=workers,
-    )
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    # The jobs of a sweep share their data: the first one makes it, the others wait.
+    with FileLock(folder.parent / f".{category}.lock"):
+        sequences, test_names = _sequences(category, data, output, workers)
+        return prepare(
+            sequences,
+            depth_source(depth),
+            prep,
+            test_names=test_names,
+            folder=folder,
+            workers=workers,
+        )
 
 
 def _sequences(

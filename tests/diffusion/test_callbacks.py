@@ -1,4 +1,6 @@
-"""What keeps a run alive: whole files, a table that forgets what a killed run did behind its checkpoint."""
+"""What keeps a run alive: whole files, a table that forgets what a killed run did behind its
+checkpoint.
+"""
 
 from pathlib import Path
 

@@ -35,9 +35,7 @@ def test_plain_diffusers_loads_the_folder(config: ModelConfig, tmp_path: Path) -
     assert float(schedule.alphas_cumprod[-1]) == pytest.approx(0, abs=1e-6)
 
 
-def test_half_precision_on_disk_leaves_the_model_alone(
-    config: ModelConfig, tmp_path: Path
-) -> None:
+def test_half_precision_on_disk_leaves_the_model_alone(config: ModelConfig, tmp_path: Path) -> None:
     model = ExtrapolationModel(config)
     save_model(model, tmp_path / "model", torch.float16)
     assert model.unet.conv_in.weight.dtype == torch.float32

@@ -1,4 +1,6 @@
-"""The condition's channels are METHOD section 3's, in its order, and its null is one and the same everywhere."""
+"""The condition's channels are METHOD section 3's, in its order, and its null is one and the same
+everywhere.
+"""
 
 from dataclasses import replace
 
@@ -43,9 +45,7 @@ def test_channels_stand_in_the_documented_order(batch: PairBatch) -> None:
 def test_the_encoding_of_the_warp_points_at_the_reference_pixel(batch: PairBatch) -> None:
     """Query and reference of the same pose: the warped coordinates are the reference's own grid."""
     alone = torch.tensor([[True, False, False]] * 3)
-    same = replace(
-        batch, camera=batch.reference_cameras[:, 0], reference_valid=alone, warp=None
-    )
+    same = replace(batch, camera=batch.reference_cameras[:, 0], reference_valid=alone, warp=None)
     latents, _ = concatenated_latents(with_warp(same), PixelPatches(2), 2)
     own, encoded = latents[:, 24:32], latents[:, 32:40]
     inside = (..., slice(2, -2), slice(2, -2))

@@ -24,7 +24,9 @@ def test_a_step_to_the_right_and_back() -> None:
 
 
 def test_a_quarter_turn_to_the_left() -> None:
-    """Turning left about the vertical is +90° about y in both OpenGL and, seen from above, the world."""
+    """Turning left about the vertical is +90° about y in both OpenGL and, seen from above, the
+    world.
+    """
     reference = Camera(torch.eye(4)[None], _INTRINSICS, 64, 64)
     # OpenCV: after a left turn, forward is −x of the reference, right is +z.
     turned = torch.tensor([[[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]]])

@@ -41,9 +41,7 @@ class Oracle(nn.Module):
 def test_an_oracle_denoiser_returns_the_truth(
     config: ModelConfig, batch: PairBatch, prediction: str, zero_snr: bool, residual: bool
 ) -> None:
-    chosen = replace(
-        config, prediction=prediction, zero_terminal_snr=zero_snr, residual=residual
-    )
+    chosen = replace(config, prediction=prediction, zero_terminal_snr=zero_snr, residual=residual)
     oracle = Oracle(ExtrapolationModel(chosen), batch)
     generators = [view_generator(0, str(i)) for i in range(3)]
     image = sample_views(oracle, batch, SamplerConfig(steps=20), generators)  # type: ignore[arg-type]
@@ -64,9 +62,7 @@ def test_a_view_does_not_depend_on_its_batch(
 ) -> None:
     model = _randomised(config)
     options = SamplerConfig(steps=4, eta=eta, guidance=2.0)
-    together = sample_views(
-        model, batch, options, [view_generator(1, name) for name in "abc"]
-    )
+    together = sample_views(model, batch, options, [view_generator(1, name) for name in "abc"])
     alone = sample_views(model, batch, options, [view_generator(1, name) for name in "xbz"])
     torch.testing.assert_close(together[1], alone[1], atol=1e-5, rtol=0)
     assert (together[0] - alone[0]).abs().max() > 1e-3, "another name is another noise"
@@ -84,7 +80,9 @@ def test_guidance_of_one_is_the_conditional_prediction(
 
 
 def test_an_untrained_model_returns_the_filled_warp(config: ModelConfig, batch: PairBatch) -> None:
-    """Its last layer is zero and it denoises a residual: at v = 0 the mean of what it paints is its base."""
+    """Its last layer is zero and it denoises a residual: at v = 0 the mean of what it paints is its
+    base.
+    """
     model = ExtrapolationModel(replace(config, prediction="sample")).eval()
     generators = [view_generator(0, name) for name in "abc"]
     image = sample_views(model, batch, SamplerConfig(steps=5), generators)

@@ -26,7 +26,8 @@ def test_every_weight_receives_a_gradient(config: ModelConfig, batch: PairBatch)
     model = ExtrapolationModel(config)
     torch.nn.init.normal_(model.unet.conv_out.weight, std=0.1)
     diffusion_loss(model, batch, _generator(0), 0.0).backward()
-    # With one token, softmax over keys is constant: queries and keys of cross-attention learn nothing.
+    # With one token, softmax over keys is constant: queries and keys of cross-attention learn
+    # nothing.
     idle = {n for n, p in model.named_parameters() if p.grad is None or not p.grad.any()}
     assert all(".attn2.to_q." in n or ".attn2.to_k." in n or ".norm2." in n for n in idle), idle
 

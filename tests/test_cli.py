@@ -1,0 +1,102 @@
+"""Wrong options and unusable input end with one line that says what to do, and with nothing half-
+written.
+"""
+
+import gzip
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from extrap_train.__main__ import main
+
+
+def _error(arguments: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> str:
+    """What the command line says before it gives up; it must be one line and leave no run."""
+    monkeypatch.setattr(sys, "argv", ["extrap_train", *arguments, f"output={tmp_path / 'out'}"])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    message = str(stopped.value)
+    assert message.startswith("error: ")
+    assert "\n" not in message
+    assert not list(tmp_path.glob("out/train/**/summary.json"))
+    return message
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "category is not given"),
+        (["category=hydrnt"], "did you mean hydrant?; known: all, apple, book"),
+        (["category=hydrant", "data=coed"], "did you mean co3d"),
+        (["category=hydrant", "experiment=smalbase"], "experiment=smalbase is unknown"),
+        (["category=hydrant", "trainer.stesp=3"], "did you mean trainer.steps"),
+        (["category=hydrant", "mdoel=small"], "did you mean model"),
+        (["category=hydrant", "trainer.steps=abc"], "'abc' of type 'str' could not be converted"),
+        (["category=hydrant", "trainer.steps=0"], "trainer.steps=0: must be above 0"),
+        (["category=hydrant", "task=scne"], "task=scne is unknown; known: category"),
+        (["category=hydrant", "model.prediction=eps"], "known: epsilon, v_prediction, sample"),
+        (["category=hydrant", "model.image_size=96"], "prep.image_size=64: give both the same"),
+        (["category=hydrant", "model.patch=7"], "no multiple of 28"),
+        (["category=hydrant", "data=co3d"], "give data.root=FOLDER"),
+    ],
+)
+def test_a_wrong_option_is_one_clear_line(
+    arguments: list[str], said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    assert said in _error(arguments, monkeypatch, tmp_path)
+
+
+def test_a_missing_root_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    options = ["category=hydrant", "data=co3d", f"data.root={tmp_path / 'nowhere'}"]
+    assert "nowhere" in _error([*options, "model.start=null"], monkeypatch, tmp_path)
+
+
+def test_annotations_that_climb_out_are_refused(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    folder = tmp_path / "co3d" / "hydrant"
+    folder.mkdir(parents=True)
+    viewpoint = {
+        "R": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+        "T": [0, 0, 5],
+        "focal_length": [2, 2],
+        "principal_point": [0, 0],
+        "intrinsics_format": "ndc_isotropic",
+    }
+    frame = {
+        "sequence_name": "a",
+        "frame_number": 0,
+        "image": {"path": "../../secret.jpg", "size": [64, 64]},
+        "viewpoint": viewpoint,
+    }
+    sequence = {"sequence_name": "a", "category": "hydrant"}
+    for name, entries in (("frame", [frame]), ("sequence", [sequence])):
+        content = gzip.compress(json.dumps(entries).encode())
+        (folder / f"{name}_annotations.jgz").write_bytes(content)
+    options = ["category=hydrant", "data=co3d", f"data.root={tmp_path / 'co3d'}"]
+    message = _error([*options, "model.start=null"], monkeypatch, tmp_path)
+    assert "../../secret.jpg" in message
+
+
+def test_a_start_that_is_no_model_lists_those_in_the_package(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    message = _error(["category=hydrant", "model.start=nonsense"], monkeypatch, tmp_path)
+    assert "model.start=nonsense is neither a model folder nor one of the package's" in message
+
+
+@pytest.mark.parametrize("module", ["extrap_train", "data_prep", "benchmarks"])
+def test_help_needs_no_torch(module: str) -> None:
+    """`--help` must be instant: it may not import the libraries that take seconds."""
+    code = (
+        "import runpy, sys; sys.argv = ['x', '--help']\n"
+        f"try: runpy.run_module('{module}', run_name='__main__')\n"
+        "except SystemExit: pass\n"
+        "print('HEAVY' if 'torch' in sys.modules else 'LIGHT')"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert result.stdout.rstrip().endswith("LIGHT"), result.stdout + result.stderr
+    assert "usage" in result.stdout.lower()

@@ -1,0 +1,133 @@
+"""The main job on a tiny category: what it leaves, that it is repeatable, and that no kill changes
+its result.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+_TINY = [
+    "category=hydrant",
+    "data.train_sequences=2",
+    "data.test_sequences=1",
+    "data.frames=12",
+    "data.image_size=32",
+    "model.start=null",
+    "model.image_size=16",
+    "prep.image_size=16",
+    "prep.max_gap_deg=60",
+    "model.octaves=2",
+    "model.unet.channels=[16,32]",
+    "model.unet.attention_levels=[false,true]",
+    "model.unet.heads=2",
+    "model.unet.token_width=16",
+    "trainer.steps=12",
+    "trainer.checkpoint_every=3",
+    "trainer.validate_every=6",
+    "trainer.batch_size=2",
+    "validation.examples=4",
+    "validation.pictures=2",
+    "sampler.steps=2",
+]
+
+
+def _start(output: Path, *more: str) -> "subprocess.Popen[str]":
+    command = [sys.executable, "-m", "extrap_train", *_TINY, f"output={output}", *more]
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment
+    )
+
+
+def _finish(output: Path, *more: str) -> str:
+    process = _start(output, *more)
+    text, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, text
+    return text
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    output = tmp_path_factory.mktemp("undisturbed")
+    _finish(output)
+    return output
+
+
+def _run_folder(output: Path) -> Path:
+    return (output / "train/hydrant/small/latest").resolve()
+
+
+def _weights(output: Path) -> dict[str, bytes]:
+    model = _run_folder(output) / "model"
+    return {str(p.relative_to(model)): p.read_bytes() for p in model.rglob("*.safetensors")}
+
+
+def test_the_contract_of_files_is_kept(undisturbed: Path) -> None:
+    run = _run_folder(undisturbed)
+    names = {path.name for path in run.iterdir()}
+    expected = {"config.yaml", "metrics.csv", "samples", "checkpoints", "model", "summary.json"}
+    assert expected <= names
+    summary = json.loads((run / "summary.json").read_text())
+    assert list(summary["validation"]) == ["model", "nearest", "inpainted", "mean_fill"]
+    for row in summary["validation"].values():
+        assert {"psnr", "psnr_holes", "ssim", "lpips"} <= row.keys()
+    assert set(summary["seconds"]) == {"prepare", "train", "validate"}
+    assert summary["steps"] == 12
+    for name, reason in summary["missing"].items():
+        assert summary["validation"]["model"][name] is None
+        assert reason
+    table = pd.read_csv(run / "metrics.csv")
+    assert table["step"].is_monotonic_increasing
+    assert table["validation/psnr"].notna().sum() == 2
+    assert (run / "samples" / "final.png").stat().st_size > 1000
+
+
+def test_a_second_run_says_that_it_is_done(undisturbed: Path) -> None:
+    before = _weights(undisturbed)
+    text = _finish(undisturbed)
+    assert "already trained for 12 steps" in text
+    assert _weights(undisturbed) == before
+
+
+def test_killed_at_any_moment_the_weights_are_the_same(undisturbed: Path, tmp_path: Path) -> None:
+    """SIGKILL during preparation, between checkpoints and right after the last; then run to the
+    end.
+    """
+    checkpoints = tmp_path / "train/hydrant/small"
+    moments = [
+        lambda: any(tmp_path.glob("synthetic/hydrant/0000/**/*.jpg")),
+        lambda: any(checkpoints.glob("*/checkpoints/step-00000003.ckpt")),
+        lambda: (
+            any(checkpoints.glob("*/checkpoints/.step-00000009.ckpt*"))
+            or any(checkpoints.glob("*/checkpoints/step-00000009.ckpt"))
+        ),
+        lambda: any(checkpoints.glob("*/checkpoints/step-00000012.ckpt")),
+    ]
+    for reached in moments:
+        process = _start(tmp_path)
+        while process.poll() is None and not reached():
+            time.sleep(0.005)
+        assert process.poll() is None, process.communicate()[0]
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+    _finish(tmp_path)
+    assert _weights(tmp_path) == _weights(undisturbed)
+    table = pd.read_csv(_run_folder(tmp_path) / "metrics.csv")
+    assert table["step"].is_unique
+
+
+def test_a_longer_training_goes_on_where_the_shorter_ended(
+    undisturbed: Path, tmp_path: Path
+) -> None:
+    for name in ("synthetic", "data"):
+        (tmp_path / name).symlink_to(undisturbed / name)
+    _finish(tmp_path, "trainer.steps=6")
+    _finish(tmp_path)
+    assert _weights(tmp_path) == _weights(undisturbed)
