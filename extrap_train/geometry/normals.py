@@ -19,6 +19,8 @@ from extrap_train.views import Camera
 ALWAYS_SURFACE = 3.0
 """Tangent of the angle between viewing ray and normal up to which two neighbours always form a
 surface (72°)."""
+DEPTH_NOISE = 0.02
+"""Steps up to this share of the depth are no edges either: sensors and estimates are no better."""
 NEVER_SURFACE = 30.0
 """... and beyond which they never do (88°)."""
 LARGEST_BEND = 0.7
@@ -115,7 +117,9 @@ def _sides(
     straight = _on_a_line(slope, both)
     steep = slope.abs()
     linked = both & (
-        (steep < ALWAYS_SURFACE * limit) | ((steep < NEVER_SURFACE * limit) & straight)
+        (steep < ALWAYS_SURFACE * limit)
+        | (steep < DEPTH_NOISE * farther)
+        | ((steep < NEVER_SURFACE * limit) & straight)
     )
     jump = both & ~linked
     before, after = functional.pad(linked, (1, 0)), functional.pad(linked, (0, 1))
