@@ -133,7 +133,7 @@ class ModelConfig:
     """Of the positional encoding: 4 channels each."""
     residual: bool = True
     """Denoise the difference to the hole-filled warp instead of the image itself."""
-    prediction: str = "v_prediction"
+    prediction: str = "sample"
     """`epsilon`, `v_prediction` or `sample`."""
     zero_terminal_snr: bool = True
     unet: UNetConfig = field(default_factory=UNetConfig)
@@ -149,7 +149,7 @@ class ModelConfig:
 class SamplerConfig:
     """How a view is sampled (DDIM)."""
 
-    steps: int = 20
+    steps: int = 8
     eta: float = 0.0
     guidance: float = 1.0
     """Weight of the conditional prediction against the null condition's; 1 is no guidance."""
@@ -162,7 +162,7 @@ class TrainerConfig:
     steps: int = 3000
     batch_size: int = 16
     warmup_steps: int = 100
-    condition_dropout: float = 0.1
+    condition_dropout: float = 0.05
     """Share of the training examples whose condition is the null condition."""
     ema_decay: float = 0.999
     precision: str = "bf16-mixed"
