@@ -111,9 +111,9 @@ class PrepConfig:
 class UNetConfig:
     """Shape of the denoiser (diffusers' `UNet2DConditionModel`)."""
 
-    channels: list[int] = field(default_factory=lambda: [64, 128, 192])
+    channels: list[int] = field(default_factory=lambda: [32, 64, 128, 192])
     layers_per_block: int = 1
-    attention_levels: list[bool] = field(default_factory=lambda: [False, False, True])
+    attention_levels: list[bool] = field(default_factory=lambda: [False, False, False, True])
     heads: int = 4
     token_width: int = 192
     """Width of the one cross-attention token."""
