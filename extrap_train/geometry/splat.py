@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrap_train.geometry.splat_kernel import OUTSIDE, ScreenPoints
+from extrap_train.geometry.screen_points import OUTSIDE, ScreenPoints
 from extrap_train.geometry.splat_numba import project_numba, splat_pixels_numba
 from extrap_train.geometry.splat_torch import splat_pixels_torch
 from extrap_train.views import Camera
@@ -17,7 +17,7 @@ from extrap_train.views import Camera
 class Splat:
     """Splatted values, weighted means; zero where nothing landed (`weight` 0)."""
 
-    values: Float[Tensor, "b h w c"]
+    values: Float[Tensor, "b c h w"]
     weight: Float[Tensor, "b h w"]
     """Σ b·exp(-β·z): bilinear coverage by the nearest surface."""
 
@@ -31,7 +31,7 @@ def splat(
     inputs = (world_points, values, pixels_from_world)
     project = _project if _needs_torch(*inputs) else project_numba
     u, v, depth = project(world_points, pixels_from_world)
-    reach = depth.new_ones(1).expand_as(depth)
+    reach = torch.ones_like(depth)
     image = torch.zeros(len(depth), dtype=torch.long, device=depth.device)
     points = ScreenPoints(u, v, depth, reach, reach, image)
     return splat_pixels(points, values, 1, camera.height, camera.width)
@@ -72,7 +72,5 @@ def splat_pixels(
     """
     in_torch = _needs_torch(points.u, points.depth, values)
     run = splat_pixels_torch if in_torch else splat_pixels_numba
-    summed = run(points, values, (images, height, width))
-    weight = summed[..., -1]
-    mean = summed[..., :-1] / torch.where(weight > 0, weight, 1)[..., None]
-    return Splat(mean, weight)
+    drawn = run(points, values, (images, height, width))
+    return Splat(drawn[:, :-1], drawn[:, -1])

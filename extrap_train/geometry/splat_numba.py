@@ -1,5 +1,9 @@
-"""Softmax splatting on the CPU: every thread owns a band of rows, so no atomics and the same bits
-on any count."""
+"""Softmax splatting on the CPU: every thread draws a band of rows, so there are no atomics, and
+the same bits come out on any number of them.
+
+A band is drawn into a frame of its own with a margin of one pixel, so that nothing in the inner
+loops asks where the image ends; what falls into the margin belongs to a neighbouring band.
+"""
 
 import math
 
@@ -9,33 +13,39 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrap_train.geometry.splat_compiled import compiled
-from extrap_train.geometry.splat_kernel import DEPTH_SHARPNESS, OUTSIDE, ScreenPoints
+from extrap_train.geometry.compiled import compiled
+from extrap_train.geometry.screen_points import DEPTH_SHARPNESS, OUTSIDE, ScreenPoints
 
-_ONE = np.float32(1)
-_HALF = np.float32(0.5)
+_HALF, _ONE = np.float32(0.5), np.float32(1)
 _OUTSIDE = np.float32(OUTSIDE)
 _SHARPNESS = np.float32(DEPTH_SHARPNESS)
 _NEGLIGIBLE = np.float32(60.0)
-"""Exponent beyond which a point weighs nothing."""
-_USUAL_LANES = 8
+"""Exponent from which on a point weighs nothing."""
+_BELOW_ONE = np.nextafter(_ONE, np.float32(0))
+"""A pixel's centre at a distance of one whole pixel is out of the kernel's reach."""
+_INFINITE = np.float32(127 * math.log(2))
+"""Exponent that stands for no weight at all: 2⁻¹²⁷ is written with no bits."""
 _LN2, _PER_LN2 = np.float32(math.log(2)), np.float32(1 / math.log(2))
 _SIXTH, _24TH, _120TH = (np.float32(1 / math.factorial(n)) for n in (3, 4, 5))
-_POWERS = np.float32(2.0) ** -np.arange(90, dtype=np.float32)
+_LANES = 8
+"""Values are added in vectors of this length."""
+_BLOCK = 64
+"""Points whose weights are computed at a time."""
 
 
 def splat_pixels_numba(
     points: ScreenPoints, values: Float[Tensor, "n c"], size: tuple[int, int, int]
-) -> Float[Tensor, "b h w c1"]:
-    """Weighted sums of the values, and the summed weight as the last channel, for `size` = (b, h,
+) -> Float[Tensor, "b c1 h w"]:
+    """Weighted means of the values, and the summed weight as the last channel, for `size` = (b, h,
     w)."""
     images, height, width = size
     starts = torch.searchsorted(points.image, torch.arange(images + 1))
-    columns = (points.u, points.v, points.depth, points.reach_u, points.reach_v, values, starts)
-    summed = torch.zeros(images, height, width, values.shape[1] + 1)
+    places = (points.u, points.v, points.depth, points.reach_u, points.reach_v)
+    columns = (x.detach().contiguous().numpy() for x in (*places, values, starts))
+    means = torch.empty(images, values.shape[1] + 1, height, width)
     bands = -(-numba.get_num_threads() // images)
-    _splat(*(x.detach().numpy() for x in columns), bands, summed.numpy())
-    return summed
+    _splat(*columns, bands, means.numpy())
+    return means
 
 
 @compiled(parallel=True)
@@ -48,16 +58,21 @@ def _splat(
     values: np.ndarray,
     starts: np.ndarray,
     bands: int,
-    summed: np.ndarray,
+    means: np.ndarray,
 ) -> None:
-    images, height, width, _ = summed.shape
-    nearest = np.full((images, height, width), np.float32(np.inf), np.float32)
+    images, channels, height, width = means.shape
+    lanes = -(-channels // _LANES) * _LANES
     for task in numba.prange(images * bands):
         image, band = task // bands, task % bands
-        rows = (height * band // bands, height * (band + 1) // bands)
+        top, bottom = height * band // bands, height * (band + 1) // bands
+        pixels = (bottom - top + 2) * (width + 2)
+        nearest = np.full(pixels, np.float32(np.inf), np.float32)
+        summed = np.zeros((pixels, lanes), np.float32)
         span = (starts[image], starts[image + 1])
-        _find_nearest(u, v, depth, reach_u, reach_v, span, rows, nearest[image])
-        _add(u, v, depth, values, span, rows, nearest[image], summed[image])
+        frame = (top, bottom, width)
+        _find_nearest(u, v, depth, reach_u, reach_v, span, frame, nearest)
+        _add(u, v, depth, values, span, frame, nearest, summed)
+        _write_means(summed, top, bottom, means[image])
 
 
 @compiled()
@@ -68,98 +83,152 @@ def _find_nearest(
     reach_u: np.ndarray,
     reach_v: np.ndarray,
     span: tuple[int, int],
-    rows: tuple[int, int],
+    frame: tuple[int, int, int],
     nearest: np.ndarray,
 ) -> None:
     """Least depth of the points that reach each pixel's centre."""
-    top, bottom = rows
-    width = nearest.shape[1]
+    row = frame[2] + 2
     for i in range(span[0], span[1]):
-        if not _touches(u[i], v[i], top, bottom, width):
+        if not _touches(u[i], v[i], frame):
             continue
-        y, down = _split(v[i])
-        x, right = _split(u[i])
-        for dy in range(2):
-            apart_y = _ONE - down if dy else down
-            if not (top <= y + dy < bottom and apart_y <= reach_v[i]):
-                continue
-            for dx in range(2):
-                apart_x = _ONE - right if dx else right
-                inside = 0 <= x + dx < width and apart_x <= reach_u[i]
-                if inside and (_ONE - apart_x) * (_ONE - apart_y) > 0:
-                    nearest[y + dy, x + dx] = min(nearest[y + dy, x + dx], depth[i])
+        pixel, right, down = _place(u[i], v[i], frame)
+        far_u, far_v = min(reach_u[i], _BELOW_ONE), min(reach_v[i], _BELOW_ONE)
+        z = depth[i]
+        if right <= far_u and down <= far_v:
+            nearest[pixel] = min(nearest[pixel], z)
+        if _ONE - right <= far_u and down <= far_v:
+            nearest[pixel + 1] = min(nearest[pixel + 1], z)
+        if right <= far_u and _ONE - down <= far_v:
+            nearest[pixel + row] = min(nearest[pixel + row], z)
+        if _ONE - right <= far_u and _ONE - down <= far_v:
+            nearest[pixel + row + 1] = min(nearest[pixel + row + 1], z)
 
 
 @compiled(contract=True)
-def _add(  # noqa: C901  in one piece: a call in the inner loop costs a third of the time
+def _add(
     u: np.ndarray,
     v: np.ndarray,
     depth: np.ndarray,
     values: np.ndarray,
     span: tuple[int, int],
-    rows: tuple[int, int],
+    frame: tuple[int, int, int],
     nearest: np.ndarray,
     summed: np.ndarray,
 ) -> None:
     """Add the points' values to the pixels around them, by kernel and depth."""
-    top, bottom = rows
-    width, channels = nearest.shape[1], values.shape[1]
-    lanes = np.ones(channels + 1, np.float32)  # the point's values, and 1 to sum the weights
-    for i in range(span[0], span[1]):
-        if not _touches(u[i], v[i], top, bottom, width):
-            continue
-        y, down = _split(v[i])
-        x, right = _split(u[i])
-        for c in range(channels):
-            lanes[c] = values[i, c]
-        for dy in range(2):
-            if not top <= y + dy < bottom:
-                continue
-            row = np.uint32(y + dy)  # unsigned: no check for an index from the end
-            kernel_y = down if dy else _ONE - down
-            for dx in range(2):
-                if not 0 <= x + dx < width:
-                    continue
-                column = np.uint32(x + dx)
-                least = nearest[row, column]
-                exponent = _SHARPNESS * (abs(depth[i] - least) / least)
-                if not exponent < _NEGLIGIBLE:
-                    continue
-                kernel_x = right if dx else _ONE - right
-                weight = kernel_x * kernel_y * _exp_minus(exponent)
-                if channels + 1 == _USUAL_LANES:  # known when compiled: one vector instruction
-                    for c in range(_USUAL_LANES):
-                        summed[row, column, c] += weight * lanes[c]
-                else:
-                    for c in range(channels + 1):
-                        summed[row, column, c] += weight * lanes[c]
+    row = frame[2] + 2
+    pixels = np.zeros(_BLOCK, np.uint32)
+    right = np.zeros(_BLOCK, np.float32)
+    down = np.zeros(_BLOCK, np.float32)
+    block_depth = np.ones(_BLOCK, np.float32)
+    weights = np.empty((4, _BLOCK), np.float32)
+    rows = np.zeros((_BLOCK, summed.shape[1]), np.float32)
+    rows[:, values.shape[1]] = _ONE  # sums the weights
+    i = span[0]
+    while i < span[1]:
+        filled = 0
+        while i < span[1] and filled < _BLOCK:
+            if _touches(u[i], v[i], frame):
+                pixels[filled], right[filled], down[filled] = _place(u[i], v[i], frame)
+                block_depth[filled] = depth[i]
+                for c in range(values.shape[1]):
+                    rows[filled, c] = values[i, c]
+                filled += 1
+            i += 1
+        _weigh(pixels, right, down, block_depth, row, nearest, weights)
+        _add_block(pixels, weights, rows, filled, row, summed)
 
 
 @compiled(contract=True)
-def _exp_minus(x: float) -> float:
-    """exp(−x) for 0 ≤ x < 60 to 2·10⁻⁶: a power of two from a table times a polynomial on ±ln 2 /
-    2."""
-    whole = np.uint32(x * _PER_LN2 + _HALF)
-    rest = np.float32(whole) * _LN2 - x
-    series = _ONE + rest * (
-        _ONE + rest * (_HALF + rest * (_SIXTH + rest * (_24TH + rest * _120TH)))
-    )
-    return series * _POWERS[whole]
+def _weigh(
+    pixels: np.ndarray,
+    right: np.ndarray,
+    down: np.ndarray,
+    depth: np.ndarray,
+    row: int,
+    nearest: np.ndarray,
+    weights: np.ndarray,
+) -> None:
+    """Weights of a block of points in the four pixels around each.
+
+    Always of a whole block, so that always the same vector instructions round in the same way;
+    in short loops over few arrays, so that there are any. exp(−x) is a polynomial on ±ln 2 / 2
+    (to 2·10⁻⁶) times a power of two, whose bits are written down.
+    """
+    x = np.empty(_BLOCK, np.float32)
+    bits = np.empty(_BLOCK, np.int32)
+    powers = bits.view(np.float32)
+    for corner in range(4):
+        to_u, to_v = np.float32(corner % 2), np.float32(corner // 2)
+        step = np.uint32(corner // 2 * row + corner % 2)
+        for i in range(_BLOCK):
+            x[i] = nearest[pixels[i] + step]
+        for i in range(_BLOCK):
+            exponent = _SHARPNESS * (abs(depth[i] - x[i]) / x[i])
+            x[i] = exponent if exponent < _NEGLIGIBLE else _INFINITE  # NaN, too: nothing nearest
+        for i in range(_BLOCK):
+            halvings = np.int32(x[i] * _PER_LN2 + _HALF)
+            bits[i] = (127 - halvings) << 23
+            rest = np.float32(halvings) * _LN2 - x[i]
+            x[i] = _ONE + rest * (
+                _ONE + rest * (_HALF + rest * (_SIXTH + rest * (_24TH + rest * _120TH)))
+            )
+        for i in range(_BLOCK):
+            kernel = (_ONE - abs(right[i] - to_u)) * (_ONE - abs(down[i] - to_v))
+            weights[corner, i] = kernel * x[i] * powers[i]
+
+
+@compiled(contract=True)
+def _add_block(
+    pixels: np.ndarray,
+    weights: np.ndarray,
+    rows: np.ndarray,
+    filled: int,
+    row: int,
+    summed: np.ndarray,
+) -> None:
+    for i in range(filled):
+        for corner in range(4):
+            weight = weights[corner, i]
+            if weight > 0:
+                pixel = pixels[i] + np.uint32(corner // 2 * row + corner % 2)
+                for first in range(0, rows.shape[1], _LANES):
+                    into, values = summed[pixel, first:], rows[i, first:]
+                    for lane in range(_LANES):
+                        into[lane] += weight * values[lane]
 
 
 @compiled()
-def _touches(u: float, v: float, top: int, bottom: int, width: int) -> bool:
+def _write_means(summed: np.ndarray, top: int, bottom: int, means: np.ndarray) -> None:
+    """Divide by the weight, and leave the margin behind."""
+    channels, _, width = means.shape
+    for y in range(top, bottom):
+        first = (y - top + 1) * (width + 2) + 1
+        for x in range(width):
+            weight = summed[first + x, channels - 1]
+            share = _ONE / weight if weight > 0 else _ONE
+            for c in range(channels - 1):
+                means[c, y, x] = summed[first + x, c] * share
+            means[channels - 1, y, x] = weight
+
+
+@compiled()
+def _touches(u: float, v: float, frame: tuple[int, int, int]) -> bool:
     """Whether a point lies within a pixel of the rows and columns; false for NaN, too."""
+    top, bottom, width = frame
     in_rows = np.float32(top) - _HALF <= v < np.float32(bottom) + _HALF
     return bool(in_rows and -_HALF <= u < np.float32(width) + _HALF)
 
 
 @compiled()
-def _split(position: float) -> tuple[np.int32, np.floating]:
-    """Whole and fractional part of a coordinate, counted from pixel centres."""
-    shifted = position - _HALF
-    whole = np.float32(math.floor(shifted))
-    return np.int32(whole), shifted - whole
+def _place(
+    u: float, v: float, frame: tuple[int, int, int]
+) -> tuple[np.uint32, np.floating, np.floating]:
+    """The frame's pixel whose centre lies up left of a point, and how far the point is from it."""
+    top, _, width = frame
+    left, above = np.float32(math.floor(u - _HALF)), np.float32(math.floor(v - _HALF))
+    pixel = np.uint32((np.int64(above) - top + 1) * (width + 2) + np.int64(left) + 1)
+    return pixel, u - _HALF - left, v - _HALF - above
 
 
 def project_numba(

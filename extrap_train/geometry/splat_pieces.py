@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from extrap_train.geometry.normals import Surface
-from extrap_train.geometry.splat_kernel import ScreenPoints
+from extrap_train.geometry.screen_points import ScreenPoints
 from extrap_train.views import Camera
 
 LARGEST_SPACING = 1.05

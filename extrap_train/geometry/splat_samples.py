@@ -8,7 +8,7 @@ from torch import Tensor
 
 from extrap_train.geometry.cameras import pixel_grid
 from extrap_train.geometry.normals import Surface, plane_vectors, surface_from_depth
-from extrap_train.geometry.splat_kernel import ScreenPoints
+from extrap_train.geometry.screen_points import ScreenPoints
 from extrap_train.geometry.splat_pieces import (
     LARGEST_SPACING,
     MOST_POINTS,

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrap_train.geometry import splat_pieces, splat_unseen
-from extrap_train.geometry.splat_compiled import compiled
-from extrap_train.geometry.splat_kernel import OUTSIDE, ScreenPoints
+from extrap_train.geometry.compiled import compiled
+from extrap_train.geometry.screen_points import OUTSIDE, ScreenPoints
 from extrap_train.geometry.splat_pieces import Pieces, Samples
 from extrap_train.geometry.splat_projection import LEAST_DEPTH_RATIO
 

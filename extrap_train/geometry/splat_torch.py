@@ -4,13 +4,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from extrap_train.geometry.splat_kernel import DEPTH_SHARPNESS, ScreenPoints
+from extrap_train.geometry.screen_points import DEPTH_SHARPNESS, ScreenPoints
 
 
 def splat_pixels_torch(
     points: ScreenPoints, values: Float[Tensor, "n c"], size: tuple[int, int, int]
-) -> Float[Tensor, "b h w c1"]:
-    """Weighted sums of the values, and the summed weight as the last channel, for `size` = (b, h,
+) -> Float[Tensor, "b c1 h w"]:
+    """Weighted means of the values, and the summed weight as the last channel, for `size` = (b, h,
     w)."""
     pixel, point, kernel, reached = _footprints(points, size)
     b, h, w = size
@@ -24,7 +24,9 @@ def splat_pixels_torch(
     weight = kernel * torch.exp(-DEPTH_SHARPNESS * away)
     rows = torch.cat([values[point] * weight[:, None], weight[:, None]], 1)
     summed = torch.zeros(b * h * w, rows.shape[1], device=rows.device, dtype=rows.dtype)
-    return summed.index_add(0, pixel, rows).reshape(b, h, w, -1)
+    summed = summed.index_add(0, pixel, rows).reshape(b, h, w, -1).movedim(-1, 1)
+    total = summed[:, -1:]
+    return torch.cat([summed[:, :-1] / torch.where(total > 0, total, 1), total], 1)
 
 
 def _footprints(

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from extrap_train.geometry.normals import Surface
-from extrap_train.geometry.splat_kernel import ScreenPoints
+from extrap_train.geometry.screen_points import ScreenPoints
 from extrap_train.geometry.splat_projection import (
     LEAST_DEPTH_RATIO,
     project_pixels,

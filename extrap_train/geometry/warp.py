@@ -34,7 +34,7 @@ def warp_references(
     samples = sample_surfaces(depths, maps, cameras, query)
     values = torch.cat([samples.values, samples.points.depth[:, None]], 1)
     splat = splat_pixels(samples.points, values, b, query.height, query.width)
-    means = splat.values.permute(0, 3, 1, 2)
+    means = splat.values
     share = means[:, 5]
     nearest_mask = (share >= NEAREST_SHARE).to(images.dtype)
     coordinates = means[:, 3:5] / torch.where(nearest_mask > 0, share, 1)[:, None]

@@ -1,0 +1,4 @@
+"""How fast our kernels are, against plain reference implementations timed in the same run.
+
+One module a name, each with `run() -> list[Row]`; `benchmark perf NAME` finds it by that name.
+"""
