@@ -63,12 +63,12 @@ class ExtrapolationModel(nn.Module):
 
     def encode_target(
         self, image: Float[Tensor, "b 3 h w"], conditioning: Conditioning
-    ) -> Float[Tensor, "b z h w"]:
+    ) -> Float[Tensor, "b z h2 w2"]:
         """What is denoised: the image's latent, relative to the condition's base."""
         return self.autoencoder.encode(image) - conditioning.base
 
     def decode_target(
-        self, latent: Float[Tensor, "b z h w"], conditioning: Conditioning
+        self, latent: Float[Tensor, "b z h2 w2"], conditioning: Conditioning
     ) -> Float[Tensor, "b 3 h w"]:
         """The image in [0, 1] of a denoised latent."""
         return self.autoencoder.decode(latent + conditioning.base).clamp(0, 1)

@@ -3,15 +3,42 @@
 import copy
 import zlib
 from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float
+from diffusers import DDIMScheduler
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from extrap_train.config import SamplerConfig
 from extrap_train.diffusion.conditioning import Conditioning
-from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.views import PairBatch
+
+
+@runtime_checkable
+class ViewDenoiser(Protocol):
+    """All that sampling asks of a model; `ExtrapolationModel` is one."""
+
+    schedule: DDIMScheduler
+
+    def condition(self, batch: PairBatch) -> Conditioning:
+        """What the model is told about the batch's queries."""
+        ...
+
+    def __call__(
+        self,
+        noisy: Float[Tensor, "b z h w"],
+        timestep: Int[Tensor, " b"],
+        conditioning: Conditioning,
+    ) -> Float[Tensor, "b z h w"]:
+        """The prediction that the schedule's `prediction_type` names."""
+        ...
+
+    def decode_target(
+        self, latent: Float[Tensor, "b z h2 w2"], conditioning: Conditioning
+    ) -> Float[Tensor, "b 3 h w"]:
+        """Images in [0, 1] of denoised latents."""
+        ...
 
 
 def view_generator(seed: int, name: str) -> torch.Generator:
@@ -21,7 +48,7 @@ def view_generator(seed: int, name: str) -> torch.Generator:
 
 @torch.no_grad()
 def sample_views(
-    model: ExtrapolationModel,
+    model: ViewDenoiser,
     batch: PairBatch,
     config: SamplerConfig,
     generators: Sequence[torch.Generator],
@@ -50,7 +77,7 @@ def _noise(
 
 
 def _guided(
-    model: ExtrapolationModel,
+    model: ViewDenoiser,
     latent: Float[Tensor, "b z h w"],
     timestep: int,
     conditioning: Conditioning,

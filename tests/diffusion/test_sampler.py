@@ -44,7 +44,7 @@ def test_an_oracle_denoiser_returns_the_truth(
     chosen = replace(config, prediction=prediction, zero_terminal_snr=zero_snr, residual=residual)
     oracle = Oracle(ExtrapolationModel(chosen), batch)
     generators = [view_generator(0, str(i)) for i in range(3)]
-    image = sample_views(oracle, batch, SamplerConfig(steps=20), generators)  # type: ignore[arg-type]
+    image = sample_views(oracle, batch, SamplerConfig(steps=20), generators)
     tolerance = 1e-4 if zero_snr else 0.05  # without zero SNR the first step's noise stays a little
     assert (image - batch.image).abs().max() < tolerance
 
