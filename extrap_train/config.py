@@ -4,7 +4,8 @@ Light on purpose (no torch), so that `--help` is instant. YAMLs under `conf/` ch
 variants of a group; this file says what may stand in them.
 """
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from extrap_train.errors import InputError
@@ -105,6 +106,10 @@ class PrepConfig:
     """`require` drops what is no full circle, `prefer` does unless nothing is one, `ignore` keeps
     it.
     """
+
+
+NORM_GROUPS = 16
+"""Groups of the denoiser's normalisations: the widths of its levels are multiples of it."""
 
 
 @dataclass
@@ -221,7 +226,7 @@ class DataPrepConfig:
     seed: int = 0
     output: str = "outputs"
     workers: int | None = None
-    """Processes; null takes every core."""
+    """Sequences that are rendered or prepared at a time; null takes every core."""
 
 
 def dotted(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -235,23 +240,69 @@ def dotted(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return items
 
 
+_PRECISIONS = ("32-true", "bf16-mixed", "16-mixed", "bf16-true", "16-true", "64-true")
+
+_BOUNDS: dict[str, tuple[float, float]] = {
+    "seed": (0, 2**30),
+    "threads": (1, math.inf),
+    "workers": (1, math.inf),
+    "data.test_sequences": (1, 10_000),
+    "data.train_sequences": (1, 10_000),
+    "data.frames": (2, 10_000),
+    "data.image_size": (8, 8192),
+    "data.seed": (0, 2**30),
+    "depth.planes": (2, 4096),
+    "depth.neighbours": (1, 64),
+    "depth.image_size": (16, 8192),
+    "prep.image_size": (1, 4096),
+    "prep.max_uses": (1, math.inf),
+    "model.patch": (1, 64),
+    "model.references": (1, 16),
+    "model.octaves": (1, 16),
+    "model.unet.layers_per_block": (1, 16),
+    "model.unet.heads": (1, 64),
+    "model.unet.token_width": (1, 8192),
+    "sampler.steps": (1, 1000),
+    "sampler.eta": (0, 1),
+    "trainer.steps": (1, math.inf),
+    "trainer.batch_size": (1, math.inf),
+    "trainer.warmup_steps": (0, math.inf),
+    "trainer.condition_dropout": (0, 1),
+    "trainer.ema_decay": (0, 1),
+    "trainer.devices": (1, math.inf),
+    "trainer.checkpoint_every": (1, math.inf),
+    "trainer.validate_every": (1, math.inf),
+    "trainer.workers": (0, 1024),
+    "validation.examples": (1, math.inf),
+    "validation.batch_size": (1, math.inf),
+    "validation.pictures": (1, math.inf),
+}
+"""Least and greatest value of every number whose range its type does not say."""
+
+
 def validate(config: TrainConfig | DataPrepConfig, tasks: tuple[str, ...]) -> None:
     """Check what types cannot say; raises InputError with option, value and remedy."""
+    _check_bounds(config)
     _check_prep(config.prep)
     if isinstance(config.data, Co3dConfig) and not config.data.root:
         raise InputError("data=co3d needs the folder of the download: give data.root=FOLDER")
     if isinstance(config, TrainConfig):
         _check_one_of("task", config.task, tasks)
+        _check_one_of("trainer.precision", config.trainer.precision, _PRECISIONS)
         _check_model(config.model, config.prep)
-        _check_positive(
-            "trainer", config.trainer, ("steps", "batch_size", "checkpoint_every", "validate_every")
-        )
-        _check_positive("sampler", config.sampler, ("steps",))
-        _check_positive("validation", config.validation, ("examples", "batch_size", "pictures"))
+
+
+def _check_bounds(config: TrainConfig | DataPrepConfig) -> None:
+    for name, value in dotted(asdict(config)).items():
+        least, greatest = _BOUNDS.get(name, (-math.inf, math.inf))
+        if not isinstance(value, int | float) or least <= value <= greatest:
+            continue
+        if greatest == math.inf:
+            raise InputError(f"{name}={value}: must be at least {least:g}")
+        raise InputError(f"{name}={value}: must be from {least:g} to {greatest:g}")
 
 
 def _check_prep(prep: PrepConfig) -> None:
-    _check_positive("prep", prep, ("image_size", "max_uses"))
     _check_one_of("prep.full_circle", prep.full_circle, ("require", "prefer", "ignore"))
     if not 0 <= prep.min_pair_angle_deg < prep.max_pair_angle_deg <= 90:
         raise InputError(
@@ -266,6 +317,11 @@ def _check_model(model: ModelConfig, prep: PrepConfig) -> None:
         raise InputError(
             f"model.image_size={model.image_size} but "
             f"prep.image_size={prep.image_size}: give both the same"
+        )
+    odd = [width for width in model.unet.channels if width <= 0 or width % NORM_GROUPS]
+    if odd or not model.unet.channels:
+        raise InputError(
+            f"model.unet.channels={model.unet.channels}: need multiples of {NORM_GROUPS}"
         )
     coarsest = model.patch * 2 ** (len(model.unet.channels) - 1)
     if model.image_size % coarsest:
@@ -285,9 +341,3 @@ def _check_model(model: ModelConfig, prep: PrepConfig) -> None:
 def _check_one_of(name: str, value: str, known: tuple[str, ...]) -> None:
     if value not in known:
         raise InputError(f"{name}={value} is unknown; known: {', '.join(known)}")
-
-
-def _check_positive(group: str, options: Any, names: tuple[str, ...]) -> None:
-    for name in names:
-        if getattr(options, name) <= 0:
-            raise InputError(f"{group}.{name}={getattr(options, name)}: must be above 0")
