@@ -12,7 +12,9 @@ from typing import Any
 
 import hydra
 from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -49,9 +51,14 @@ def command(name: str, run: Callable[[Any], None]) -> None:
 
     @hydra.main(version_base="1.3", config_path="pkg://conf", config_name=name)
     def composed(config: DictConfig) -> None:
-        typed = typed_config(config)
-        _use_threads(getattr(typed, "threads", None))
-        run(typed)
+        try:
+            typed = typed_config(config)
+            _use_threads(getattr(typed, "threads", None))
+            run(typed)
+        except InputError as error:
+            if HydraConfig.get().mode == RunMode.MULTIRUN:
+                raise  # the other jobs of a sweep still run
+            sys.exit(f"error: {error}")  # before Hydra adds a line of its own
 
     try:
         _check(name, sys.argv[1:])
@@ -59,6 +66,8 @@ def command(name: str, run: Callable[[Any], None]) -> None:
         composed()
     except InputError as error:
         sys.exit(f"error: {error}")
+    except (HydraException, OmegaConfBaseException) as error:
+        sys.exit(f"error: {_one_line(error, _overrides(sys.argv[1:]))}")
     except KeyboardInterrupt:
         sys.exit("interrupted: run the same command again to resume")
 
@@ -75,7 +84,7 @@ def typed_config(config: DictConfig) -> Any:
 
 def _check(name: str, arguments: list[str]) -> None:
     """Compose once before Hydra does, so that its errors fit one line with a suggestion."""
-    overrides = [a for a in arguments if "=" in a and not a.startswith("-")]
+    overrides = _overrides(arguments)
     if {"--help", "-h"} & set(arguments):
         if not any(o.startswith(("category=", "experiment=")) for o in overrides):
             sys.argv.append("category=hydrant")  # help shows a whole tree
@@ -87,6 +96,10 @@ def _check(name: str, arguments: list[str]) -> None:
             typed_config(hydra.compose(name, overrides))
     except (HydraException, OmegaConfBaseException) as error:
         raise InputError(_one_line(error, overrides)) from None
+
+
+def _overrides(arguments: list[str]) -> list[str]:
+    return [argument for argument in arguments if not argument.startswith("-")]
 
 
 def _one_line(error: Exception, overrides: list[str]) -> str:

@@ -35,7 +35,16 @@ def _error(arguments: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
         (["category=hydrant", "trainer.stesp=3"], "did you mean trainer.steps"),
         (["category=hydrant", "mdoel=small"], "did you mean model"),
         (["category=hydrant", "trainer.steps=abc"], "'abc' of type 'str' could not be converted"),
-        (["category=hydrant", "trainer.steps=0"], "trainer.steps=0: must be above 0"),
+        (["category=hydrant", "trainer.steps=0"], "trainer.steps=0: must be at least 1"),
+        (["category=hydrant", "threads=0"], "threads=0: must be at least 1"),
+        (["category=hydrant", "seed=-1"], "seed=-1: must be from 0"),
+        (["category=hydrant", "depth=stereo", "depth.planes=1"], "depth.planes=1: must be from 2"),
+        (["category=hydrant", "model.patch=0"], "model.patch=0: must be from 1"),
+        (["category=hydrant", "model.unet.channels=[30,60]"], "need multiples of 16"),
+        (["category=hydrant", "trainer.precision=half"], "known: 32-true, bf16-mixed"),
+        (["category=hydrant", "~prep.image_size"], "prep.image_size"),
+        (["category=hydrant", "hydrant"], "hydrant"),
+        (["-m", "category=hydrnt,apple"], "did you mean hydrant"),
         (["category=hydrant", "task=scne"], "task=scne is unknown; known: category"),
         (["category=hydrant", "model.prediction=eps"], "known: epsilon, v_prediction, sample"),
         (["category=hydrant", "model.image_size=96"], "prep.image_size=64: give both the same"),
@@ -49,9 +58,12 @@ def test_a_wrong_option_is_one_clear_line(
     assert said in _error(arguments, monkeypatch, tmp_path)
 
 
-def test_a_missing_root_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_missing_root_is_named_and_hydra_adds_no_line(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     options = ["category=hydrant", "data=co3d", f"data.root={tmp_path / 'nowhere'}"]
     assert "nowhere" in _error([*options, "model.start=null"], monkeypatch, tmp_path)
+    assert "Error executing job" not in capfd.readouterr().err
 
 
 def test_annotations_that_climb_out_are_refused(
