@@ -30,8 +30,16 @@ def zeronvs_pose(
 
     The matrix is inv(cam_to_world of the reference) @ cam_to_world of the query in OpenGL axes;
     its translation, in units of the scene scale, is squashed to 0.5·10·tanh(t/10). The field of
-    view is the smaller of the query's two, in radians.
+    view is the smaller of the query's two, in radians. Full precision also where the network runs
+    in less: far from the world's origin the product would lose the translation.
     """
+    with torch.autocast(reference.world_to_cam.device.type, enabled=False):
+        return _zeronvs_pose(reference, query, scale)
+
+
+def _zeronvs_pose(
+    reference: Camera, query: Camera, scale: Float[Tensor, " b"]
+) -> Float[Tensor, "b 19"]:
     reference_to_world = opengl_from_world_to_cam(reference.world_to_cam)
     query_to_world = opengl_from_world_to_cam(query.world_to_cam)
     relative = torch.linalg.inv(reference_to_world) @ query_to_world

@@ -54,6 +54,16 @@ def test_the_encoding_does_not_depend_on_the_unit() -> None:
     torch.testing.assert_close(encodings[0], encodings[1])
 
 
+def test_half_precision_around_it_changes_nothing() -> None:
+    """A metre apart, a kilometre from the world's origin: bfloat16 would lose the metre."""
+    reference, query = torch.eye(4)[None].clone(), torch.eye(4)[None].clone()
+    reference[0, 0, 3], query[0, 0, 3] = 1000.0, 1001.0
+    cameras = [Camera(matrix, _INTRINSICS, 64, 64) for matrix in (reference, query)]
+    exact = zeronvs_pose(*cameras, torch.ones(1))
+    with torch.autocast("cpu", torch.bfloat16):
+        torch.testing.assert_close(zeronvs_pose(*cameras, torch.ones(1)), exact, atol=0, rtol=0)
+
+
 def test_scale_ignores_unknown_depth_and_survives_its_absence() -> None:
     depth = torch.zeros(2, 8, 8)
     depth[0, ::8, ::8] = 3.0
