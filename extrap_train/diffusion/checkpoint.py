@@ -7,11 +7,12 @@ from dataclasses import asdict
 from pathlib import Path
 
 import torch
-from diffusers import UNet2DConditionModel
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
+from torch import nn
 
 from extrap_train.config import ModelConfig, UNetConfig
+from extrap_train.data.files import write_whole
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError
 
@@ -38,25 +39,31 @@ def save_model(model: ExtrapolationModel, folder: Path, dtype: torch.dtype = tor
     """
     temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
     shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir(parents=True)
-    _save_unet(model.unet, temporary / "unet", dtype)
-    model.schedule.save_pretrained(temporary / "scheduler")
-    for part in _PARTS:
-        tensors = getattr(model, part).state_dict()
-        (temporary / part).mkdir()
-        path = temporary / part / "model.safetensors"
-        save_file({k: v.detach().to("cpu", dtype).contiguous() for k, v in tensors.items()}, path)
-    (temporary / _CONFIG).write_text(json.dumps(asdict(model.config), indent=1) + "\n")
-    if folder.exists():
-        shutil.rmtree(folder)
-    temporary.replace(folder)
+    try:
+        for part, path in _weight_files(temporary).items():
+            write_whole(path, _safetensors(getattr(model, part), dtype))
+        write_whole(
+            temporary / _CONFIG, (json.dumps(asdict(model.config), indent=1) + "\n").encode()
+        )
+        model.unet.save_config(temporary / "unet")
+        model.schedule.save_pretrained(temporary / "scheduler")
+        if folder.exists():
+            shutil.rmtree(folder)
+        temporary.replace(folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _save_unet(unet: UNet2DConditionModel, folder: Path, dtype: torch.dtype) -> None:
-    """Through a copy, so that the model that goes on training keeps its precision."""
-    state = {k: v.detach().to("cpu", dtype).contiguous() for k, v in unet.state_dict().items()}
-    unet.save_config(folder)
-    save_file(state, folder / "diffusion_pytorch_model.safetensors", metadata={"format": "pt"})
+def _weight_files(folder: Path) -> dict[str, Path]:
+    files = {part: folder / part / "model.safetensors" for part in _PARTS}
+    return files | {"unet": folder / "unet" / "diffusion_pytorch_model.safetensors"}
+
+
+def _safetensors(module: nn.Module, dtype: torch.dtype) -> bytes:
+    """A copy, so that the module that goes on training keeps its precision."""
+    tensors = module.state_dict()
+    state = {k: v.detach().to("cpu", dtype).contiguous() for k, v in tensors.items()}
+    return save(state, metadata={"format": "pt"})
 
 
 def load_model(folder: Path) -> ExtrapolationModel:
@@ -73,9 +80,7 @@ def load_model(folder: Path) -> ExtrapolationModel:
 
 def load_weights(model: ExtrapolationModel, folder: Path) -> None:
     """Fill a model with a folder's weights; names and shapes must be the same."""
-    parts = {part: folder / part / "model.safetensors" for part in _PARTS}
-    parts["unet"] = folder / "unet" / "diffusion_pytorch_model.safetensors"
-    for part, path in parts.items():
+    for part, path in _weight_files(folder).items():
         try:
             getattr(model, part).load_state_dict(load_file(path))
         except (OSError, SafetensorError) as error:

@@ -1,5 +1,7 @@
 """A saved model is a diffusers folder, loads strictly, and says in one line what does not fit."""
 
+import errno
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -61,6 +63,22 @@ def test_a_damaged_folder_names_the_file(config: ModelConfig, tmp_path: Path, pa
         path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(InputError, match=part):
         load_model(tmp_path / "model")
+
+
+def test_a_full_disk_leaves_the_older_model(
+    config: ModelConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    older = ExtrapolationModel(config)
+    save_model(older, tmp_path / "model")
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(InputError, match="No space left on device"):
+        save_model(ExtrapolationModel(config), tmp_path / "model")
+    assert [path.name for path in tmp_path.iterdir()] == ["model"]
+    weight = load_model(tmp_path / "model").image_encoder[0].weight
+    assert torch.equal(weight, older.image_encoder[0].weight)
 
 
 def test_an_unknown_start_lists_what_there_is(config: ModelConfig) -> None:
