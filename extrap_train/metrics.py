@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from skimage.metrics import structural_similarity
-from torch import Tensor
+from torch import Tensor, nn
 
 from extrap_train.errors import InputError
 
@@ -76,7 +76,7 @@ def squeeze_lpips(
         )
     network = lpips.LPIPS(net="squeeze", pnet_rand=weights is not None, verbose=False).eval()
     if weights is not None:
-        network.load_state_dict(_state_dict(Path(weights)))
+        _load(network, Path(weights))
     network.requires_grad_(False)
 
     @torch.no_grad()
@@ -89,12 +89,13 @@ def squeeze_lpips(
     return distance
 
 
-def _state_dict(path: Path) -> dict[str, Tensor]:
+def _load(network: nn.Module, path: Path) -> None:
     if not path.is_file():
         raise InputError(f"LPIPS weights not found: {path} (option validation.lpips_weights)")
     try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, OSError, EOFError, ValueError, pickle.UnpicklingError):
+        network.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
+    except (RuntimeError, OSError, EOFError, ValueError, TypeError, pickle.UnpicklingError):
         raise InputError(
-            f"{path}: is no state dict of plain tensors (option validation.lpips_weights)"
+            f"{path}: is no full state dict of lpips.LPIPS(net='squeeze'), plain tensors only "
+            "(option validation.lpips_weights)"
         ) from None
