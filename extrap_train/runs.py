@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 import platform
+import shutil
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any
 import torch
 import yaml
 
-from extrap_train.config import TrainConfig, dotted
+from extrap_train.config import SyntheticConfig, TrainConfig, dotted
 from extrap_train.data.files import write_whole
 from extrap_train.errors import InputError
 
@@ -22,13 +23,13 @@ _NOT_PART_OF_THE_RUN = (
     "resume",
     "threads",
     "validation",
-    "data.root",
     "trainer.steps",
 )
 """Keys that may differ on resume: where things lie, how they are measured, and a longer training.
-
 """
 
+_LATEST = "latest"
+"""Link to the newest run of a model and category."""
 _PACKAGES = ("torch", "lightning", "diffusers", "numba", "numpy", "extrap-train")
 
 
@@ -60,29 +61,48 @@ class RunFolder:
 
 
 def run_identity(config: TrainConfig) -> dict[str, Any]:
-    """The options that make a run what it is, by dotted key."""
+    """The options that make a run what it is, by dotted key.
+
+    The data's root is one of them, but for synthetic data, which is the same wherever it lies.
+    """
+    left_out = list(_NOT_PART_OF_THE_RUN)
+    if isinstance(config.data, SyntheticConfig):
+        left_out.append("data.root")
     return {
         key: value
         for key, value in dotted(asdict(config)).items()
-        if not any(key == name or key.startswith(f"{name}.") for name in _NOT_PART_OF_THE_RUN)
+        if not any(key == name or key.startswith(f"{name}.") for name in left_out)
     }
 
 
 def open_run(config: TrainConfig) -> RunFolder:
     """Make or find the run's folder, write its configuration, and point `latest` at it.
 
-    Raises InputError where a run of that name was started with other options and is to be resumed.
+    With `resume=false` what an earlier run of that name left is removed first. Raises InputError
+    where a run of that name was started with other options and is to be resumed.
     """
     identity = run_identity(config)
     digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:8]
     name = config.run or f"seed{config.seed}-{digest}"
+    if name == _LATEST or Path(name).name != name:
+        raise InputError(f"run={name}: must be the name of a folder, other than {_LATEST}")
     path = Path(config.output) / "train" / config.category.name / config.model.name / name
     saved = path / "config.yaml"
     if saved.is_file() and config.resume:
         _check_same(saved, identity)
+    if not config.resume:
+        _start_over(path)
     write_whole(saved, yaml.safe_dump(asdict(config), sort_keys=False).encode())
-    _point(path.parent / "latest", name)
+    _point(path.parent / _LATEST, name)
     return RunFolder(path)
+
+
+def _start_over(path: Path) -> None:
+    """Remove what would make a later command resume the old run, or take it for finished."""
+    folder = RunFolder(path)
+    folder.summary.unlink(missing_ok=True)
+    shutil.rmtree(folder.checkpoints, ignore_errors=True)
+    (path / "metrics.csv").unlink(missing_ok=True)
 
 
 def _check_same(saved: Path, identity: dict[str, Any]) -> None:

@@ -5,7 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from extrap_train.config import CategoryConfig, ModelConfig, SyntheticConfig, TrainConfig
+from extrap_train.config import (
+    CategoryConfig,
+    Co3dConfig,
+    ModelConfig,
+    SyntheticConfig,
+    TrainConfig,
+)
 from extrap_train.config import DatasetDepthConfig as Depth
 from extrap_train.errors import InputError
 from extrap_train.runs import open_run
@@ -43,3 +49,29 @@ def test_resuming_a_named_run_with_other_options_says_which(config: TrainConfig)
     with pytest.raises(InputError, match=r"model\.learning_rate \(was 0\.0003, now 0\.5\)"):
         open_run(changed)
     open_run(replace(changed, resume=False))
+
+
+def test_starting_over_forgets_the_finished_run(config: TrainConfig) -> None:
+    """Else a new run that is killed early would be taken for the finished old one."""
+    run = open_run(config)
+    run.checkpoints.mkdir()
+    (run.checkpoints / "step-00000001.ckpt").touch()
+    run.summary.write_text("{}")
+    open_run(config)
+    assert run.summary.exists()
+    open_run(replace(config, resume=False))
+    assert not run.summary.exists()
+    assert not run.checkpoints.exists()
+
+
+def test_another_download_is_another_run(config: TrainConfig) -> None:
+    one, two = (replace(config, data=Co3dConfig(root=root)) for root in ("one", "two"))
+    assert open_run(one) != open_run(two)
+    moved = replace(config, data=SyntheticConfig(root="elsewhere"))
+    assert open_run(moved) == open_run(config)
+
+
+@pytest.mark.parametrize("name", ["latest", "../other", "a/b"])
+def test_a_run_has_the_name_of_a_folder(config: TrainConfig, name: str) -> None:
+    with pytest.raises(InputError, match="must be the name of a folder"):
+        open_run(replace(config, run=name))
