@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from extrap_train.data.files import check_relative, read_json
+from extrap_train.data.images import MAX_PIXELS
 from extrap_train.data.validation import require_list
 from extrap_train.errors import InputError
 from extrap_train.geometry.pytorch3d import NDC_FORMATS
@@ -80,7 +81,7 @@ def _parse_all(file: Path, parse: Callable[[Any, Path], T]) -> list[T]:
 def _frame(entry: Any, file: Path) -> FrameAnnotation:
     image, viewpoint = entry["image"], entry.get("viewpoint")
     height, width = (_typed(side, int, "image size") for side in image["size"])
-    if height <= 0 or width <= 0:
+    if not (0 < height <= MAX_PIXELS and 0 < width <= MAX_PIXELS):
         raise ValueError(f"image size {height} x {width}")
     # CO3D's first release has no format: it knew only this one.
     ndc = (viewpoint or {}).get("intrinsics_format", "ndc_norm_image_bounds")

@@ -10,6 +10,8 @@ from typing import Any
 
 from extrap_train.errors import InputError
 
+MAX_NAME_BYTES = 255
+"""Of a file or folder, on every common file system."""
 GZIP_FLOOR_BYTES = 64 * 2**20
 GZIP_RATIO = 100
 """Annotations shrink to between a third and a tenth; a decompression bomb, to a thousandth."""
@@ -19,12 +21,23 @@ _LEAVES_FOLDER = re.compile(r"^[/\\]|^[A-Za-z]:|(^|[/\\])\.\.([/\\]|$)|\0")
 
 
 def check_relative(relative: str, file: Path) -> str:
-    """`relative` unchanged, if its text cannot lead out of a folder; `file` is where it stood."""
+    """`relative` unchanged, if its text cannot lead out of a folder and a file may be called so.
+
+    `file` is where it stood.
+    """
     if not relative or _LEAVES_FOLDER.search(relative):
         raise InputError(
             f"{file}: the path {relative!r} is absolute, empty or climbs out of its folder; "
             "only paths below the data set's root can be read: correct the entry"
         )
+    try:
+        longest = max(map(len, os.fsencode(relative).split(b"/")))
+    except UnicodeEncodeError:
+        raise InputError(
+            f"{file}: the path {relative!a} is no Unicode; correct the entry"
+        ) from None
+    if longest > MAX_NAME_BYTES:
+        raise InputError(f"{file}: the path {relative[:60]!r}… has too long a name; correct it")
     return relative
 
 
@@ -34,12 +47,17 @@ def resolve_inside(root: Path, relative: str) -> Path:
     Raises InputError where it is missing or where a link leads out of `root`.
     """
     path = root / relative
-    resolved = path.resolve()
+    try:
+        resolved = path.resolve()
+        exists = resolved.is_file()
+    except (OSError, RuntimeError, ValueError) as error:  # too long, or a loop of links
+        reason = str(error).split(":")[0]
+        raise InputError(f"{path}: no file can be there ({reason}); correct the entry") from None
     if not resolved.is_relative_to(root.resolve()):
         raise InputError(
             f"{path}: leads out of {root} to {resolved}; copy the file into the data set instead"
         )
-    if not resolved.is_file():
+    if not exists:
         raise InputError(f"{path}: no such file; restore it or remove its entry")
     return resolved
 

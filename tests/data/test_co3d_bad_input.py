@@ -103,6 +103,7 @@ def test_gzip_bomb(root):
         ({"image": {"path": "x.jpg"}}, "entry 0 has no 'size'"),
         ({"image": {"path": "x.jpg", "size": [32]}}, "entry 0 is malformed"),
         ({"image": {"path": "x.jpg", "size": [0, 40]}}, "image size 0 x 40"),
+        ({"image": {"path": "x.jpg", "size": [10**400, 40]}}, "entry 0 is malformed"),
         ({"image": {"path": "x.jpg", "size": ["32", "40"]}}, "image size is '32'"),
         ({"image": {"path": 7, "size": [32, 40]}}, "path is 7"),
         ({"sequence_name": 5}, "sequence_name is 5"),

@@ -18,6 +18,20 @@ def test_other_paths_are_refused(path):
         check_relative(path, Path("list.json"))
 
 
+@pytest.mark.parametrize("path", ["x" * 256, "a/" + "ü" * 128, "a\ud800"])
+def test_names_that_no_file_has_are_refused(path):
+    with pytest.raises(InputError, match=r"list\.json: the path .* correct"):
+        check_relative(path, Path("list.json"))
+
+
+@pytest.mark.parametrize("path", ["loop", "a/" * 3000])
+def test_what_the_system_cannot_resolve_is_one_line(tmp_path, path):
+    (tmp_path / "loop").symlink_to("loop")
+    with pytest.raises(InputError) as refused:
+        resolve_inside(tmp_path, path)
+    assert "\n" not in str(refused.value)
+
+
 def test_links_may_stay_inside_but_not_lead_out(tmp_path):
     root = tmp_path / "root"
     root.mkdir()
