@@ -37,6 +37,8 @@ def read_text_images(file: Path) -> list[ModelImage]:
     lines = list(_lines(file))
     while lines and not lines[0][1].strip():
         lines.pop(0)
+    while lines and not lines[-1][1].strip():
+        lines.pop()
     images = []
     for number, line in lines[::2]:
         # A name may hold spaces.
@@ -45,8 +47,6 @@ def read_text_images(file: Path) -> list[ModelImage]:
             pose = tuple(float(field) for field in fields[1:8])
             camera, name = int(fields[8]), fields[9].strip()
         except (IndexError, ValueError):
-            if not line.strip() and number == lines[-1][0]:
-                break
             raise _malformed(file, number) from None
         images.append(ModelImage(name, camera, pose[:4], pose[4:]))
     return images

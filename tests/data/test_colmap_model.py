@@ -179,6 +179,15 @@ def test_text_files_that_make_no_sense(tmp_path, file, line, expected):
     assert expected in complaint(tmp_path)
 
 
+def test_empty_lines_around_the_text_mean_nothing(tmp_path):
+    binary(tmp_path)
+    for name in ("cameras.bin", "images.bin"):
+        (tmp_path / name).unlink()
+    (tmp_path / "cameras.txt").write_text("7 PINHOLE 40 32 50 50 20 16\n\n\n")
+    (tmp_path / "images.txt").write_text("\n1 1 0 0 0 0 0 3 7 a.png\n\n\n\n")
+    assert len(read(tmp_path).frames) == 1
+
+
 def test_temple_features_lie_on_their_epipolar_lines(shared, tmp_path):
     folder = shared / "data" / "templeSparseRing"
     entries = []
