@@ -1,6 +1,7 @@
 """One training example: a query frame and its references, read from prepared data."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -51,7 +52,7 @@ class ExampleReader:
         self.references = references
         self._prepared = prepared
         self._pairs = [(data, pair) for data in prepared for pair in data.pairs(split)]
-        self._angles: dict[tuple[int, str], np.ndarray] = {}
+        self._angles: dict[tuple[Path, str], np.ndarray] = {}
 
     def __len__(self) -> int:
         return len(self._pairs)
@@ -98,7 +99,7 @@ class ExampleReader:
         )
 
     def _angles_of(self, data: PreparedData, sequence: str) -> np.ndarray:
-        key = (id(data), sequence)
+        key = (data.folder, sequence)  # no `id`: it means nothing in a worker process
         if key not in self._angles:
             cameras = data.cameras(sequence)
             self._angles[key] = pairwise_angles(cameras, scene_center(cameras))
