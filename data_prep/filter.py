@@ -6,14 +6,13 @@ from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from jaxtyping import Float
 
 from extrap_train.config import PrepConfig
 from extrap_train.data.sequences import Sequence
 from extrap_train.data.validation import is_degenerate
 from extrap_train.geometry.viewpoints import facing, fit_orbit, scene_center
-from extrap_train.views import Camera
+from extrap_train.views import Camera, stack_poses
 
 LOG = logging.getLogger(__name__)
 
@@ -62,7 +61,7 @@ def judge(sequence: Sequence, options: PrepConfig) -> Verdict:
     least = MIN_FRAMES if circle else 2
     if count < least:
         return Verdict(False, f"{count} frames, fewer than {least}", count)
-    cameras = poses(sequence)
+    cameras = stack_poses([frame.camera for frame in sequence.frames])
     unsound = is_degenerate(cameras).nonzero().flatten().tolist()
     if unsound:
         name = sequence.frames[unsound[0]].name
@@ -75,17 +74,6 @@ def judge(sequence: Sequence, options: PrepConfig) -> Verdict:
     if circle:
         reasons += _circle_reasons(facing_share, gap, coverage, options)
     return Verdict(not reasons, "; ".join(reasons), count, gap, coverage)
-
-
-def poses(sequence: Sequence) -> Camera:
-    """All cameras of a sequence as one batch, for their poses: the size is the first frame's."""
-    cameras = [frame.camera for frame in sequence.frames]
-    return Camera(
-        torch.stack([camera.world_to_cam for camera in cameras]),
-        torch.stack([camera.intrinsics for camera in cameras]),
-        cameras[0].height,
-        cameras[0].width,
-    )
 
 
 def azimuth_coverage(cameras: Camera) -> tuple[float, float]:

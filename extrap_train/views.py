@@ -87,6 +87,16 @@ def stack_cameras(cameras: Sequence[Camera]) -> Camera:
     return combine(cameras, lambda tensors: torch.stack(list(tensors)))
 
 
+def stack_poses(cameras: Sequence[Camera]) -> Camera:
+    """One batched camera for its poses alone: sizes may differ, and the first one's is stated."""
+    return Camera(
+        torch.stack([camera.world_to_cam for camera in cameras]),
+        torch.stack([camera.intrinsics for camera in cameras]),
+        cameras[0].height,
+        cameras[0].width,
+    )
+
+
 @dataclass(frozen=True)
 class View:
     """A posed photograph, with its depth and object mask where they are known."""

@@ -5,7 +5,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrap_train.depth.photo_cost import projection_between
-from extrap_train.views import Camera
+from extrap_train.geometry.viewpoints import scene_center
+from extrap_train.views import Camera, stack_poses
 
 NEAREST, FARTHEST = 0.3, 20.0
 """Range of depths, as multiples of the scene centre's depth."""
@@ -17,15 +18,13 @@ LEAST_CONVERGENCE_RAD = 0.05
 """Optical axes that differ by less have no nearest point worth the name."""
 
 
-def scene_center(cameras: list[Camera]) -> Float[Tensor, "3"] | None:
-    """The least-squares nearest point to all optical axes; None if they are nearly parallel."""
-    centers = torch.stack([camera.center for camera in cameras]).double()
-    axes = torch.stack([camera.forward for camera in cameras]).double()
+def convergence_point(cameras: list[Camera]) -> Float[Tensor, "3"] | None:
+    """`scene_center` of cameras whose optical axes meet; None if they are nearly parallel."""
+    poses = stack_poses(cameras)
+    axes = poses.forward.double()
     if float(torch.acos((axes @ axes.mT).clamp(-1, 1)).max()) < LEAST_CONVERGENCE_RAD:
         return None
-    across = torch.eye(3).to(axes) - axes[:, :, None] * axes[:, None, :]
-    normal_matrix, moment = across.sum(0), (across @ centers[:, :, None]).sum(0)
-    return torch.linalg.solve(normal_matrix, moment)[:, 0].float()
+    return torch.from_numpy(scene_center(poses)).to(poses.world_to_cam)
 
 
 def inverse_depth_range(

@@ -11,7 +11,7 @@ from torch.nn import functional
 from extrap_train.config import StereoConfig
 from extrap_train.depth import DepthMap, PointMaps, point_maps_of
 from extrap_train.depth.consistency import agreement, forward_backward_error
-from extrap_train.depth.depth_range import inverse_depth_range, scene_center
+from extrap_train.depth.depth_range import convergence_point, inverse_depth_range
 from extrap_train.depth.neighbours import choose_neighbours
 from extrap_train.depth.plane_sweep import Estimate, sweep
 from extrap_train.errors import InputError
@@ -71,13 +71,13 @@ class PlaneSweepStereo:
     def neighbours(self, views: Sequence[View]) -> list[list[int]]:
         """Indices of the views that help each view, the most useful first."""
         cameras = [view.camera for view in views]
-        return choose_neighbours(cameras, scene_center(cameras), self.config.neighbours)
+        return choose_neighbours(cameras, convergence_point(cameras), self.config.neighbours)
 
     def _maps(
         self, views: list[View], helpers: list[list[int]], wanted: Sequence[int]
     ) -> list[DepthMap]:
         working = [self._working(view) for view in views]
-        center = scene_center([view.camera for view in views])
+        center = convergence_point([view.camera for view in views])
         needed = sorted({*wanted, *(j for i in wanted for j in helpers[i])})
         estimates = {
             i: self._estimate(working[i], [working[j] for j in helpers[i]], center)

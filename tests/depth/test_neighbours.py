@@ -1,12 +1,12 @@
 from traced_scenes import orbit_camera
 
-from extrap_train.depth.depth_range import scene_center
+from extrap_train.depth.depth_range import convergence_point
 from extrap_train.depth.neighbours import choose_neighbours
 
 
 def chosen(azimuths_deg: list[float], count: int) -> list[list[float]]:
     cameras = [orbit_camera(azimuth_deg, 64) for azimuth_deg in azimuths_deg]
-    indices = choose_neighbours(cameras, scene_center(cameras), count)
+    indices = choose_neighbours(cameras, convergence_point(cameras), count)
     return [[azimuths_deg[i] for i in row] for row in indices]
 
 
