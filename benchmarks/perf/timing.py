@@ -33,7 +33,7 @@ def compare(
     reference: Callable[[], Float[Tensor, "..."]],
     repeats: int = 15,
 ) -> Row:
-    """Run both in turn, so that whatever else the machine does hits both; the first round is free."""
+    """Run both in turn, so that whatever else the machine does hits both; one round to warm up."""
     difference = float((ours() - reference()).abs().max())
     pairs = [
         (_milliseconds(ours, device), _milliseconds(reference, device)) for _ in range(repeats)

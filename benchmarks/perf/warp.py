@@ -29,14 +29,10 @@ def _compare(size: int, device: torch.device) -> Row:
     points, values = (x.to(device) for x in bumpy_views(size))
     query = orbit_camera(QUERY_ANGLE_DEG, size).to(device)
 
-    def ours() -> Float[Tensor, "c1 h w"]:
-        drawn = splat(points, values, query)
-        return torch.cat([drawn.values[0], drawn.weight])
-
     return compare(
         f"{len(ANGLES_DEG)} references, {size}x{size}, {CHANNELS} channels",
         device,
-        ours,
+        lambda: splat(points, values, query).means,
         lambda: splat_reference(points, values, query).permute(2, 0, 1),
     )
 

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrap_train.geometry.screen_points import DEPTH_SHARPNESS
+from extrap_train.geometry.splat_torch import DEPTH_SHARPNESS
 from extrap_train.views import Camera
 
 

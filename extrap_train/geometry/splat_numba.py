@@ -10,20 +10,20 @@ import math
 import numba
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from extrap_train.geometry.compiled import compiled
-from extrap_train.geometry.screen_points import DEPTH_SHARPNESS, OUTSIDE, ScreenPoints
+from extrap_train.geometry.splat_torch import DEPTH_SHARPNESS, OUTSIDE
 
-_HALF, _ONE = np.float32(0.5), np.float32(1)
+_HALF, _ONE, _INFINITY = (np.float32(x) for x in (0.5, 1, np.inf))
 _OUTSIDE = np.float32(OUTSIDE)
 _SHARPNESS = np.float32(DEPTH_SHARPNESS)
 _NEGLIGIBLE = np.float32(60.0)
 """Exponent from which on a point weighs nothing."""
 _BELOW_ONE = np.nextafter(_ONE, np.float32(0))
 """A pixel's centre at a distance of one whole pixel is out of the kernel's reach."""
-_INFINITE = np.float32(127 * math.log(2))
+_WEIGHTLESS = np.float32(127 * math.log(2))
 """Exponent that stands for no weight at all: 2⁻¹²⁷ is written with no bits."""
 _LN2, _PER_LN2 = np.float32(math.log(2)), np.float32(1 / math.log(2))
 _SIXTH, _24TH, _120TH = (np.float32(1 / math.factorial(n)) for n in (3, 4, 5))
@@ -33,110 +33,125 @@ _BLOCK = 64
 """Points whose weights are computed at a time."""
 
 
-def splat_pixels_numba(
-    points: ScreenPoints, values: Float[Tensor, "n c"], size: tuple[int, int, int]
+def splat_numba(
+    points: Float[np.ndarray, "3 n"],
+    reach: Float[np.ndarray, "2 n"] | Float[np.ndarray, "2 1"],
+    values: Float[np.ndarray, "n c"],
+    spans: Int[np.ndarray, "b m 2"],
+    height: int,
+    width: int,
 ) -> Float[Tensor, "b c1 h w"]:
-    """Weighted means of the values, and the summed weight as the last channel, for `size` = (b, h,
-    w)."""
-    images, height, width = size
-    starts = torch.searchsorted(points.image, torch.arange(images + 1))
-    places = (points.u, points.v, points.depth, points.reach_u, points.reach_v)
-    columns = (x.detach().contiguous().numpy() for x in (*places, values, starts))
+    """Weighted means of the values, and the summed weight as the last channel.
+
+    Points are u, v and depth, with their reach along u and v (or that of all of them), as in
+    `splat_torch.ScreenPoints`; those of an image are the ones from the first up to the second
+    index of each of its spans.
+    """
+    images = len(spans)
     means = torch.empty(images, values.shape[1] + 1, height, width)
     bands = -(-numba.get_num_threads() // images)
-    _splat(*columns, bands, means.numpy())
+    _splat(points, reach, values, spans, bands, means.numpy())
     return means
 
 
 @compiled(parallel=True)
 def _splat(
-    u: np.ndarray,
-    v: np.ndarray,
-    depth: np.ndarray,
-    reach_u: np.ndarray,
-    reach_v: np.ndarray,
+    points: np.ndarray,
+    reach: np.ndarray,
     values: np.ndarray,
-    starts: np.ndarray,
+    spans: np.ndarray,
     bands: int,
     means: np.ndarray,
 ) -> None:
-    images, channels, height, width = means.shape
-    lanes = -(-channels // _LANES) * _LANES
-    for task in numba.prange(images * bands):
+    height = means.shape[2]
+    for task in numba.prange(len(spans) * bands):
         image, band = task // bands, task % bands
-        top, bottom = height * band // bands, height * (band + 1) // bands
-        pixels = (bottom - top + 2) * (width + 2)
-        nearest = np.full(pixels, np.float32(np.inf), np.float32)
-        summed = np.zeros((pixels, lanes), np.float32)
-        span = (starts[image], starts[image + 1])
-        frame = (top, bottom, width)
-        _find_nearest(u, v, depth, reach_u, reach_v, span, frame, nearest)
-        _add(u, v, depth, values, span, frame, nearest, summed)
-        _write_means(summed, top, bottom, means[image])
+        rows = (height * band // bands, height * (band + 1) // bands)
+        _draw_band(points, reach, values, spans[image], rows, means[image])
+
+
+@compiled()
+def _draw_band(
+    points: np.ndarray,
+    reach: np.ndarray,
+    values: np.ndarray,
+    spans: np.ndarray,
+    rows: tuple[int, int],
+    means: np.ndarray,
+) -> None:
+    channels, _, width = means.shape
+    frame = (rows[0], rows[1], width)
+    pixels = (rows[1] - rows[0] + 2) * (width + 2)
+    nearest = np.full(pixels, _INFINITY, np.float32)
+    summed = np.zeros((pixels, -(-channels // _LANES) * _LANES), np.float32)
+    _find_nearest(points, reach, spans, frame, nearest)
+    _add(points, values, spans, frame, nearest, summed)
+    _write_means(summed, frame, means)
 
 
 @compiled()
 def _find_nearest(
-    u: np.ndarray,
-    v: np.ndarray,
-    depth: np.ndarray,
-    reach_u: np.ndarray,
-    reach_v: np.ndarray,
-    span: tuple[int, int],
+    points: np.ndarray,
+    reach: np.ndarray,
+    spans: np.ndarray,
     frame: tuple[int, int, int],
     nearest: np.ndarray,
 ) -> None:
     """Least depth of the points that reach each pixel's centre."""
-    row = frame[2] + 2
-    for i in range(span[0], span[1]):
-        if not _touches(u[i], v[i], frame):
-            continue
-        pixel, right, down = _place(u[i], v[i], frame)
-        far_u, far_v = min(reach_u[i], _BELOW_ONE), min(reach_v[i], _BELOW_ONE)
-        z = depth[i]
-        if right <= far_u and down <= far_v:
-            nearest[pixel] = min(nearest[pixel], z)
-        if _ONE - right <= far_u and down <= far_v:
-            nearest[pixel + 1] = min(nearest[pixel + 1], z)
-        if right <= far_u and _ONE - down <= far_v:
-            nearest[pixel + row] = min(nearest[pixel + row], z)
-        if _ONE - right <= far_u and _ONE - down <= far_v:
-            nearest[pixel + row + 1] = min(nearest[pixel + row + 1], z)
+    u, v, depth = points
+    row, each = frame[2] + 2, reach.shape[1] > 1
+    for span in range(len(spans)):
+        for i in range(spans[span, 0], spans[span, 1]):
+            if not _touches(u[i], v[i], frame):
+                continue
+            pixel, right, down = _place(u[i], v[i], frame)
+            far_u = min(reach[0, i if each else 0], _BELOW_ONE)
+            far_v = min(reach[1, i if each else 0], _BELOW_ONE)
+            for corner in range(4):
+                apart_u = _ONE - right if corner % 2 else right
+                apart_v = _ONE - down if corner // 2 else down
+                reached = (apart_u <= far_u) & (apart_v <= far_v)
+                at = pixel + np.uint32(corner // 2 * row + corner % 2)
+                claim = depth[i] if reached else _INFINITY  # no branch: nobody could predict it
+                nearest[at] = min(nearest[at], claim)
 
 
 @compiled(contract=True)
 def _add(
-    u: np.ndarray,
-    v: np.ndarray,
-    depth: np.ndarray,
+    points: np.ndarray,
     values: np.ndarray,
-    span: tuple[int, int],
+    spans: np.ndarray,
     frame: tuple[int, int, int],
     nearest: np.ndarray,
     summed: np.ndarray,
 ) -> None:
-    """Add the points' values to the pixels around them, by kernel and depth."""
-    row = frame[2] + 2
+    """Add the points' values to the pixels around them, by kernel and depth, block by block."""
+    row, channels = frame[2] + 2, values.shape[1]
     pixels = np.zeros(_BLOCK, np.uint32)
     right = np.zeros(_BLOCK, np.float32)
     down = np.zeros(_BLOCK, np.float32)
-    block_depth = np.ones(_BLOCK, np.float32)
+    depth = np.ones(_BLOCK, np.float32)
     weights = np.empty((4, _BLOCK), np.float32)
-    rows = np.zeros((_BLOCK, summed.shape[1]), np.float32)
-    rows[:, values.shape[1]] = _ONE  # sums the weights
-    i = span[0]
-    while i < span[1]:
+    lanes = np.zeros((_BLOCK, summed.shape[1]), np.float32)
+    lanes[:, channels] = _ONE  # sums the weights
+    span, i = 0, spans[0, 0]
+    while span < len(spans):
         filled = 0
-        while i < span[1] and filled < _BLOCK:
-            if _touches(u[i], v[i], frame):
-                pixels[filled], right[filled], down[filled] = _place(u[i], v[i], frame)
-                block_depth[filled] = depth[i]
-                for c in range(values.shape[1]):
-                    rows[filled, c] = values[i, c]
+        while span < len(spans) and filled < _BLOCK:
+            if i == spans[span, 1]:
+                span += 1
+                i = spans[span, 0] if span < len(spans) else i
+                continue
+            if _touches(points[0, i], points[1, i], frame):
+                place = _place(points[0, i], points[1, i], frame)
+                pixels[filled], right[filled], down[filled] = place
+                depth[filled] = points[2, i]
+                for c in range(channels):
+                    lanes[filled, c] = values[i, c]
                 filled += 1
             i += 1
-        _weigh(pixels, right, down, block_depth, row, nearest, weights)
-        _add_block(pixels, weights, rows, filled, row, summed)
+        _weigh(pixels, right, down, depth, row, nearest, weights)
+        _add_block(pixels, weights, lanes, filled, row, summed)
 
 
 @compiled(contract=True)
@@ -165,7 +180,7 @@ def _weigh(
             x[i] = nearest[pixels[i] + step]
         for i in range(_BLOCK):
             exponent = _SHARPNESS * (abs(depth[i] - x[i]) / x[i])
-            x[i] = exponent if exponent < _NEGLIGIBLE else _INFINITE  # NaN, too: nothing nearest
+            x[i] = exponent if exponent < _NEGLIGIBLE else _WEIGHTLESS  # NaN, too: nothing nearest
         for i in range(_BLOCK):
             halvings = np.int32(x[i] * _PER_LN2 + _HALF)
             bits[i] = (127 - halvings) << 23
@@ -182,7 +197,7 @@ def _weigh(
 def _add_block(
     pixels: np.ndarray,
     weights: np.ndarray,
-    rows: np.ndarray,
+    lanes: np.ndarray,
     filled: int,
     row: int,
     summed: np.ndarray,
@@ -192,16 +207,17 @@ def _add_block(
             weight = weights[corner, i]
             if weight > 0:
                 pixel = pixels[i] + np.uint32(corner // 2 * row + corner % 2)
-                for first in range(0, rows.shape[1], _LANES):
-                    into, values = summed[pixel, first:], rows[i, first:]
+                for first in range(0, lanes.shape[1], _LANES):
+                    into, values = summed[pixel, first:], lanes[i, first:]
                     for lane in range(_LANES):
                         into[lane] += weight * values[lane]
 
 
 @compiled()
-def _write_means(summed: np.ndarray, top: int, bottom: int, means: np.ndarray) -> None:
+def _write_means(summed: np.ndarray, frame: tuple[int, int, int], means: np.ndarray) -> None:
     """Divide by the weight, and leave the margin behind."""
-    channels, _, width = means.shape
+    channels = len(means)
+    top, bottom, width = frame
     for y in range(top, bottom):
         first = (y - top + 1) * (width + 2) + 1
         for x in range(width):
@@ -233,23 +249,25 @@ def _place(
 
 def project_numba(
     world_points: Float[Tensor, "n 3"], pixels_from_world: Float[Tensor, "3 4"]
-) -> Float[Tensor, "3 n"]:
-    """Pixel u, v and depth; points at or behind the camera land outside every image, at depth 1."""
-    screen = torch.empty(3, len(world_points))
+) -> Float[np.ndarray, "3 n"]:
+    """Pixel u, v and depth; points at or behind the camera land outside every image."""
+    points = np.empty((3, len(world_points)), np.float32)
     _project(
-        world_points.contiguous().numpy(), pixels_from_world.contiguous().numpy(), screen.numpy()
+        world_points.detach().contiguous().numpy(),
+        pixels_from_world.detach().contiguous().numpy(),
+        points,
     )
-    return screen
+    return points
 
 
 @compiled(parallel=True)
-def _project(points: np.ndarray, m: np.ndarray, screen: np.ndarray) -> None:
-    for i in numba.prange(len(points)):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+def _project(world: np.ndarray, m: np.ndarray, points: np.ndarray) -> None:
+    for i in numba.prange(len(world)):
+        x, y, z = world[i, 0], world[i, 1], world[i, 2]
         depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
         if depth > 0:
-            screen[0, i] = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth
-            screen[1, i] = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth
-            screen[2, i] = depth
+            points[0, i] = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth
+            points[1, i] = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth
+            points[2, i] = depth
         else:
-            screen[0, i], screen[1, i], screen[2, i] = _OUTSIDE, _OUTSIDE, _ONE
+            points[0, i], points[1, i], points[2, i] = _OUTSIDE, _OUTSIDE, _ONE

@@ -1,13 +1,37 @@
 """Softmax splatting in torch: on any device, differentiable in positions, depth and values."""
 
+from dataclasses import dataclass, replace
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from extrap_train.geometry.screen_points import DEPTH_SHARPNESS, ScreenPoints
+DEPTH_SHARPNESS = 200.0
+"""β: a surface 5 % behind the nearest one weighs e⁻¹⁰, so it does not bleed through."""
+
+OUTSIDE = -10.0
+"""Pixel coordinate of points that are not to be drawn."""
 
 
-def splat_pixels_torch(
+@dataclass(frozen=True)
+class ScreenPoints:
+    """Points seen by cameras of one image size: `image` says by which, in ascending order."""
+
+    u: Float[Tensor, "n"]
+    v: Float[Tensor, "n"]
+    depth: Float[Tensor, "n"]
+    """Positive."""
+    reach_u: Float[Tensor, "n"]
+    """Half the width, in pixels up to 1, of the piece of surface that the point stands for."""
+    reach_v: Float[Tensor, "n"]
+    image: Int[Tensor, "n"]
+
+    def __getitem__(self, chosen: Int[Tensor, "m"]) -> "ScreenPoints":
+        """The points with these indices."""
+        return replace(self, **{name: column[chosen] for name, column in vars(self).items()})
+
+
+def splat_torch(
     points: ScreenPoints, values: Float[Tensor, "n c"], size: tuple[int, int, int]
 ) -> Float[Tensor, "b c1 h w"]:
     """Weighted means of the values, and the summed weight as the last channel, for `size` = (b, h,

@@ -1,12 +1,21 @@
-"""The warped image: what the references show of the query view (paper II-A)."""
+"""The warped image: what the references show of the query view (paper II-A).
+
+Depth maps become surfaces (`normals`), surfaces become points as dense as the query sees them
+(`warp_points`, projected by `warp_projection`), less those behind space that a reference never saw
+(`warp_walls`), and the points are drawn with weights by depth (`splat`). Each step is there twice:
+in torch, for GPUs and gradients, and under the same name with `_numba`, in loops for the CPU. The
+torch files explain the method and own its constants; both give the same picture within rounding.
+"""
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from extrap_train.geometry.encoding import coordinate_grid
-from extrap_train.geometry.splat import splat_pixels
-from extrap_train.geometry.splat_samples import sample_surfaces
+from extrap_train.geometry.splat import needs_torch
+from extrap_train.geometry.splat_numba import splat_numba
+from extrap_train.geometry.splat_torch import splat_torch
+from extrap_train.geometry.warp_points import sample_surfaces
+from extrap_train.geometry.warp_points_numba import sample_surfaces_numba
 from extrap_train.views import Camera, Warp
 
 NEAREST_SHARE = 0.02
@@ -25,16 +34,15 @@ def warp_references(
     `cameras` is batched `b k` and `query` `b`; the query's image size may differ from the
     references'. Depth 0 (or not finite) is unknown, and `valid` False leaves a reference out.
     """
-    b, k, _, h, w = images.shape
     depths = torch.where(valid[..., None, None], depths, 0)
-    grid = coordinate_grid(h, w, images.device).to(images.dtype)
-    nearest = torch.zeros(b, k, 1, h, w, device=images.device, dtype=images.dtype)
-    nearest[:, 0] = 1
-    maps = torch.cat([images, grid * nearest, nearest], 2)
-    samples = sample_surfaces(depths, maps, cameras, query)
-    values = torch.cat([samples.values, samples.points.depth[:, None]], 1)
-    splat = splat_pixels(samples.points, values, b, query.height, query.width)
-    means = splat.values
+    if needs_torch(images, depths):
+        samples = sample_surfaces(images, depths, cameras, query)
+        size = (len(images), query.height, query.width)
+        means = splat_torch(samples.points, samples.values, size)
+    else:
+        drawn = sample_surfaces_numba(images, depths, cameras, query)
+        means = splat_numba(*drawn, query.height, query.width)
+    weight = means[:, 7]
     share = means[:, 5]
     nearest_mask = (share >= NEAREST_SHARE).to(images.dtype)
     coordinates = means[:, 3:5] / torch.where(nearest_mask > 0, share, 1)[:, None]
@@ -42,7 +50,7 @@ def warp_references(
         image=means[:, :3],
         coordinates=coordinates * nearest_mask[:, None],
         depth=means[:, 6],
-        weight=splat.weight,
-        mask=(splat.weight > 0).to(images.dtype),
+        weight=weight,
+        mask=(weight > 0).to(images.dtype),
         nearest_mask=nearest_mask,
     )

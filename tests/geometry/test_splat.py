@@ -5,8 +5,8 @@ import pytest
 import scenes
 import torch
 
-from extrap_train.geometry.screen_points import DEPTH_SHARPNESS
 from extrap_train.geometry.splat import splat
+from extrap_train.geometry.splat_torch import DEPTH_SHARPNESS
 from extrap_train.views import Camera
 
 
@@ -25,15 +25,15 @@ def test_two_points_blend_by_kernel_and_depth():
     points = torch.stack([torch.tensor([3.5, 3.75]) * z, 3.5 * z, z], -1)
     drawn = splat(points, torch.tensor([[1.0], [0.0]]), pinhole())
     weight = 0.75 * torch.exp(torch.tensor(-DEPTH_SHARPNESS * 0.005))
-    assert torch.allclose(drawn.weight[0, 3, 3], 1 + weight, atol=1e-4)
-    assert torch.allclose(drawn.values[0, 0, 3, 3], 1 / (1 + weight), atol=1e-4)
-    assert drawn.weight[0, 3, 5] == 0
+    assert torch.allclose(drawn.weight[3, 3], 1 + weight, atol=1e-4)
+    assert torch.allclose(drawn.values[0, 3, 3], 1 / (1 + weight), atol=1e-4)
+    assert drawn.weight[3, 5] == 0
 
 
 def test_nearer_point_hides_the_farther():
     points = torch.tensor([[7.0, 7.0, 2.0], [14.0, 14.0, 4.0]])
     drawn = splat(points, torch.tensor([[1.0], [9.0]]), pinhole())
-    assert drawn.values[0, 0, 3, 3] == 1.0
+    assert drawn.values[0, 3, 3] == 1.0
 
 
 @pytest.mark.parametrize("channels", [1, 7, 12])

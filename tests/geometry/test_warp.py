@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numba
 import numpy as np
 import pytest
 import scenes
@@ -116,11 +117,40 @@ def test_unit_of_the_scene_does_not_matter(unit):
     assert agree.float().mean() > 0.998  # a point at a pixel's rim may round to its other side
 
 
-def test_torch_and_numba_agree():
+def noisy(depths):
+    """As sensors measure: steps, holes, and pixels that say nothing."""
+    generator = torch.Generator().manual_seed(0)
+    depths = depths * (1 + 0.02 * torch.randn(depths.shape, generator=generator))
+    depths[torch.rand(depths.shape, generator=generator) < 0.05] = 0
+    depths[torch.rand(depths.shape, generator=generator) < 0.02] = torch.nan
+    return depths
+
+
+@pytest.mark.parametrize("change", [torch.clone, noisy], ids=["exact", "noisy"])
+def test_torch_and_numba_agree(change):
     images, depths, cameras = references(scenes.SPHERE_ON_PLANE, [0, -30, 40], size=64)
+    depths = change(depths)
     query = scenes.orbit_camera(25, size=80)
     compiled = warp(images, depths, cameras, query)
     same(warp(images.clone().requires_grad_(), depths, cameras, query), compiled)
+
+
+@pytest.mark.skipif(
+    numba.config.NUMBA_NUM_THREADS < 2, reason="numba was started with one thread only"
+)
+def test_same_bits_on_one_and_two_threads():
+    images, depths, cameras = references(scenes.BOX_AND_PLANE, [0, -30, 40], size=65)
+    query = scenes.orbit_camera(25, size=81)
+    before = numba.get_num_threads()
+    results = []
+    try:
+        for threads in (1, 2, 2):
+            numba.set_num_threads(threads)
+            results.append(warp(images, depths, cameras, query))
+    finally:
+        numba.set_num_threads(before)
+    for result in results[1:]:
+        same(result, results[0], 0)
 
 
 def test_gradients():

@@ -7,52 +7,55 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from extrap_train.geometry.cameras import pixel_grid
+from extrap_train.geometry.encoding import coordinate_grid
 from extrap_train.geometry.normals import Surface, plane_vectors, surface_from_depth
-from extrap_train.geometry.screen_points import ScreenPoints
-from extrap_train.geometry.splat_pieces import (
-    LARGEST_SPACING,
-    MOST_POINTS,
-    REACH_MARGIN,
-    Pieces,
-    Samples,
-)
-from extrap_train.geometry.splat_projection import (
+from extrap_train.geometry.splat_torch import ScreenPoints
+from extrap_train.geometry.warp_projection import (
     LEAST_DEPTH_RATIO,
     project_pixels,
     reference_to_query_pixels,
     subdivide,
 )
-from extrap_train.geometry.splat_samples_numba import sample_pieces_numba
-from extrap_train.geometry.splat_unseen import hidden_by_unseen
+from extrap_train.geometry.warp_walls import hidden_by_unseen
 from extrap_train.views import Camera
+
+LARGEST_SPACING = 1.05
+"""Query pixels between neighbouring points of a surface: every pixel centre then lies well inside
+a footprint."""
+REACH_MARGIN = 0.03
+"""Query pixels by which neighbouring pieces of surface overlap, so that no seam shows what is
+behind."""
+MOST_POINTS = 8
+"""Points per reference pixel along each axis: a surface stretched further is torn, it was hardly
+seen."""
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Points of the references' surfaces that face the query camera, with interpolated values."""
+
+    points: ScreenPoints
+    values: Float[Tensor, "n 7"]
+    """Colour (3), coordinates in the nearest reference (2) and whether it is from there, depth."""
 
 
 def sample_surfaces(
+    images: Float[Tensor, "b k 3 h w"],
     depths: Float[Tensor, "b k h w"],
-    maps: Float[Tensor, "b k c h w"],
     cameras: Camera,
     query: Camera,
 ) -> Samples:
     """Sample every reference pixel as finely as the query sees it, with its surface's slope and
-    values."""
+    values: in torch, differentiable in images and depths."""
+    b, k, _, h, w = images.shape
     surface = surface_from_depth(depths, cameras)
-    query_to_reference = cameras.world_to_cam @ query.cam_to_world[:, None]
     # n·x = 1 on the tangent plane; the query's centre must lie on the reference's side of it.
-    away = plane_vectors(surface, cameras)
-    x, y, z = (away * query_to_reference[..., None, None, :3, 3]).unbind(-1)
+    towards = plane_vectors(surface, cameras) * query_centers(cameras, query)[..., None, None, :]
+    x, y, z = towards.unbind(-1)
     drawn = surface.valid & (x + y + z < 1)
-    pieces = Pieces(surface, drawn, reference_to_query_pixels(cameras, query), cameras, query)
-    differentiated = torch.is_grad_enabled() and (depths.requires_grad or maps.requires_grad)
-    if depths.is_cuda or depths.dtype != torch.float32 or differentiated:
-        return _sample(pieces, maps)
-    return sample_pieces_numba(pieces, maps)
-
-
-def _sample(pieces: Pieces, maps: Float[Tensor, "b k c h w"]) -> Samples:
-    surface, matrix, query = pieces.surface, pieces.matrix, pieces.query
-    k, c, h, w = maps.shape[1:]
+    matrix = reference_to_query_pixels(cameras, query)
     steps = _steps(surface, matrix)
-    counts = torch.where(pieces.drawn[..., None], _points_per_axis(steps), 0).reshape(-1, 2)
+    counts = torch.where(drawn[..., None], _points_per_axis(steps), 0).reshape(-1, 2)
     pixel, offset = subdivide(counts)
     corner = _Corner.around(surface, pixel, offset)
     inverse = surface.inverse_depth.reshape(-1)[pixel] + corner.steps(offset)
@@ -69,10 +72,26 @@ def _sample(pieces: Pieces, maps: Float[Tensor, "b k c h w"]) -> Samples:
     reference = (pixel // (h * w))[seen]
     depth = (ratio / inverse)[seen]
     points = ScreenPoints(u[seen], v[seen], depth, reach[:, 0], reach[:, 1], reference)
-    kept = (~hidden_by_unseen(surface, matrix, pieces.cameras, query, points)).nonzero()[:, 0]
+    kept = (~hidden_by_unseen(surface, matrix, cameras, query, points)).nonzero()[:, 0]
     points = points[kept]
-    values = corner.interpolate(maps.movedim(2, -1).reshape(-1, c), pixel, offset, seen[kept])
+    maps = _maps(images).movedim(2, -1).reshape(b * k * h * w, -1)
+    values = corner.interpolate(maps, pixel, offset, seen[kept])
+    values = torch.cat([values, points.depth[:, None]], 1)
     return Samples(replace(points, image=points.image // k), values)
+
+
+def query_centers(cameras: Camera, query: Camera) -> Float[Tensor, "b k 3"]:
+    """Where each reference camera sees the query's."""
+    return (cameras.world_to_cam @ query.cam_to_world[:, None])[..., :3, 3]
+
+
+def _maps(images: Float[Tensor, "b k 3 h w"]) -> Float[Tensor, "b k 6 h w"]:
+    """Colours, and for the nearest reference its coordinates and 1, for the others 0."""
+    b, k, _, h, w = images.shape
+    grid = coordinate_grid(h, w, images.device).to(images.dtype)
+    nearest = torch.zeros(b, k, 1, h, w, device=images.device, dtype=images.dtype)
+    nearest[:, 0] = 1
+    return torch.cat([images, grid * nearest, nearest], 2)
 
 
 def _steps(surface: Surface, matrix: Float[Tensor, "b k 3 4"]) -> Float[Tensor, "b k h w 2 2"]:

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from extrap_train.geometry.normals import Surface
-from extrap_train.geometry.screen_points import ScreenPoints
-from extrap_train.geometry.splat_projection import (
+from extrap_train.geometry.splat_torch import ScreenPoints
+from extrap_train.geometry.warp_projection import (
     LEAST_DEPTH_RATIO,
     project_pixels,
     subdivide,
