@@ -3,6 +3,7 @@ is wrong.
 """
 
 import difflib
+import errno
 import os
 import re
 import sys
@@ -21,6 +22,9 @@ from omegaconf.errors import OmegaConfBaseException
 from extrap_train import config as schema
 from extrap_train.errors import InputError
 from extrap_train.tasks import TASKS
+
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS)
+"""What a full or closed disk says, wherever it is written to."""
 
 _GROUPS: dict[str, list[type]] = {
     "category": [schema.CategoryConfig],
@@ -59,6 +63,11 @@ def command(name: str, run: Callable[[Any], None]) -> None:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise  # the other jobs of a sweep still run
             sys.exit(f"error: {error}")  # before Hydra adds a line of its own
+        except OSError as error:
+            if error.errno not in _NO_ROOM:
+                raise
+            where = error.filename or getattr(typed, "output", ".")
+            sys.exit(f"error: {where}: {error.strerror}; free space or choose another output=")
 
     try:
         _check(name, sys.argv[1:])

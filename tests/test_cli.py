@@ -2,8 +2,10 @@
 written.
 """
 
+import errno
 import gzip
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -64,6 +66,14 @@ def test_a_missing_root_is_named_and_hydra_adds_no_line(
     options = ["category=hydrant", "data=co3d", f"data.root={tmp_path / 'nowhere'}"]
     assert "nowhere" in _error([*options, "model.start=null"], monkeypatch, tmp_path)
     assert "Error executing job" not in capfd.readouterr().err
+
+
+def test_a_full_disk_anywhere_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def full(_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("extrap_train.__main__.task", lambda name: full)
+    assert "out: No space left on device" in _error(["category=hydrant"], monkeypatch, tmp_path)
 
 
 def test_annotations_that_climb_out_are_refused(
