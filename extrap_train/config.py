@@ -223,7 +223,6 @@ class DataPrepConfig:
     data: DataConfig = MISSING
     depth: DepthConfig = MISSING
     prep: PrepConfig = field(default_factory=PrepConfig)
-    seed: int = 0
     output: str = "outputs"
     workers: int | None = None
     """Sequences that are rendered or prepared at a time; null takes every core."""
