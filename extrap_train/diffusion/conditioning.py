@@ -2,8 +2,7 @@
 
 Input channels, in order: `noisy latent | reference latent | warped-image latent | PE(reference) |
 PE(warped) | mask`, all at the latents' resolution, and one cross-attention token from the
-reference's embedding and the
-relative pose.
+reference's embedding and the relative pose.
 """
 
 from dataclasses import dataclass
