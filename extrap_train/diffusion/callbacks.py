@@ -5,6 +5,7 @@ progress bar.
 import csv
 import io
 import os
+import pickle
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -48,8 +49,15 @@ class WholeCheckpointIO(TorchCheckpointIO):
         map_location: Any = lambda storage, location: storage,
         weights_only: bool | None = True,
     ) -> dict[str, Any]:
-        """Load tensors and plain values only."""
-        return torch.load(path, map_location=map_location, weights_only=True)
+        """Load tensors and plain values only; InputError where the file holds anything else."""
+        try:
+            return torch.load(path, map_location=map_location, weights_only=True)
+        except (RuntimeError, OSError, EOFError, pickle.UnpicklingError) as error:
+            reason = f"{type(error).__name__} {error}".splitlines()[0]
+            raise InputError(
+                f"{path}: cannot be resumed from ({reason}); delete it to resume from the "
+                "checkpoint before it"
+            ) from None
 
 
 class EpochCheckpoints(Callback):

@@ -53,8 +53,18 @@ def test_a_checkpoint_with_code_in_it_is_refused(tmp_path: Path) -> None:
             return print, ("code ran",)
 
     torch.save({"a": Evil()}, tmp_path / "step-00000001.ckpt")
-    with pytest.raises(Exception, match="Weights only load failed"):
+    with pytest.raises(InputError, match=r"Weights only load failed.*; delete it"):
         WholeCheckpointIO().load_checkpoint(tmp_path / "step-00000001.ckpt")
+
+
+def test_a_damaged_checkpoint_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "step-00000001.ckpt"
+    WholeCheckpointIO().save_checkpoint({"a": torch.ones(9)}, path)
+    for kept in (0, 10, 300):
+        path.write_bytes(path.read_bytes()[:kept] or b"")
+        with pytest.raises(InputError, match=r"step-00000001\.ckpt: cannot be resumed from"):
+            WholeCheckpointIO().load_checkpoint(path)
+        WholeCheckpointIO().save_checkpoint({"a": torch.ones(9)}, path)
 
 
 def test_the_average_follows_fast_at_first_and_slowly_later() -> None:
