@@ -1,6 +1,6 @@
 """Batches for training and validation, a pure function of the seed and of the step they are for."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import lightning
@@ -33,26 +33,31 @@ def with_warp(batch: PairBatch) -> PairBatch:
 class PositionSampler(Sampler[Positions]):
     """Batches of one epoch from an endless stream of shuffled passes over the pairs.
 
-    Nothing is remembered: epoch `e` of a run that was killed is the epoch `e` that it would have
-    been.
+    Nothing is remembered: `steps_done`, asked at the start of an epoch, says where in the stream it
+    begins, however long the epochs before it were. So a killed run and a prolonged one see what an
+    undisturbed run sees.
     """
 
     def __init__(
-        self, pairs: int, batch_size: int, batches: int, seed: int, rank: int = 0, world: int = 1
+        self,
+        pairs: int,
+        batch_size: int,
+        batches: int,
+        seed: int,
+        *,
+        steps_done: Callable[[], int],
+        rank: int = 0,
+        world: int = 1,
     ) -> None:
         self.pairs, self.batch_size, self.batches, self.seed = pairs, batch_size, batches, seed
-        self.rank, self.world, self.epoch = rank, world, 0
-
-    def set_epoch(self, epoch: int) -> None:
-        """Called by Lightning before every epoch."""
-        self.epoch = epoch
+        self.steps_done, self.rank, self.world = steps_done, rank, world
 
     def __len__(self) -> int:
         return self.batches
 
     def __iter__(self) -> Iterator[Positions]:
         orders: dict[int, np.ndarray] = {}
-        first = self.epoch * self.batches * self.batch_size * self.world
+        first = self.steps_done() * self.batch_size * self.world
         for batch in range(self.batches):
             start = first + (batch * self.world + self.rank) * self.batch_size
             positions = range(start, start + self.batch_size)
@@ -131,8 +136,9 @@ class PairModule(lightning.LightningDataModule):
             self.batch_size,
             self.batches_per_epoch,
             self.seed,
-            trainer.global_rank if trainer else 0,
-            trainer.world_size if trainer else 1,
+            steps_done=lambda: trainer.global_step if trainer else 0,
+            rank=trainer.global_rank if trainer else 0,
+            world=trainer.world_size if trainer else 1,
         )
         dataset = TrainingBatches(self.train, self.references, self.seed)
         return self._loader(dataset, sampler)
