@@ -4,9 +4,11 @@ import json
 import multiprocessing
 import os
 import shutil
+import threading
 import zlib
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
@@ -112,8 +114,7 @@ def _render_all(jobs: list[_Job], root: Path, workers: int) -> None:
     with ProcessPoolExecutor(
         min(workers, len(jobs)),
         mp_context=context,
-        initializer=torch.set_num_threads,
-        initargs=(1,),
+        initializer=_prepare_worker,
     ) as pool:
         futures = [pool.submit(_render_sequence, root, job) for job in jobs]
         try:
@@ -121,6 +122,19 @@ def _render_all(jobs: list[_Job], root: Path, workers: int) -> None:
                 future.result()
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+def _prepare_worker() -> None:
+    """One thread a worker, and no worker without its parent: a killed run leaves none behind."""
+    torch.set_num_threads(1)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def follow() -> None:
+        wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=follow, daemon=True).start()
 
 
 def _render_sequence(root: Path, job: _Job) -> None:

@@ -58,7 +58,7 @@ def score(prediction: Prediction, lpips: Distance | None) -> pd.DataFrame:
     be had.
 
     Images and truth go through 8 bits first. `psnr_holes` is over the pixels that no reference
-    reaches, `psnr_warped` over the others; NaN where a view has none.
+    reaches, `psnr_warped` over the others; NaN where a view has none, or where LPIPS cannot be had.
     """
     assert prediction.batch.warp is not None
     truth = quantised(prediction.batch.image)
@@ -71,9 +71,8 @@ def score(prediction: Prediction, lpips: Distance | None) -> pd.DataFrame:
             "psnr_holes": psnr(made, truth, 1 - known),
             "psnr_warped": psnr(made, truth, known),
             "ssim": ssim(made, truth),
+            "lpips": torch.full((len(made),), torch.nan) if lpips is None else lpips(made, truth),
         }
-        if lpips is not None:
-            columns["lpips"] = lpips(made, truth)
         table = pd.DataFrame(
             {name: values.cpu().double().numpy() for name, values in columns.items()}
         )

@@ -1,5 +1,7 @@
 """The training loop's mathematics and its optimiser, as a LightningModule."""
 
+import time
+
 import lightning
 import pandas as pd
 import torch
@@ -68,6 +70,8 @@ class CategoryTraining(lightning.LightningModule):
         self.validation_names = validation_names
         self.distance = lpips
         self.predictions: list[Prediction] = []
+        self.validated_step = -1
+        self.validation_seconds = 0.0
 
     def training_step(self, batch: PairBatch, batch_idx: int) -> Tensor:
         """One step; its noise is a function of seed, step and rank."""
@@ -86,9 +90,12 @@ class CategoryTraining(lightning.LightningModule):
     def on_validation_epoch_start(self) -> None:
         """Forget the last validation's pictures."""
         self.predictions = []
+        self._validation_started = time.perf_counter()
 
     def on_validation_epoch_end(self) -> None:
-        """Log the means."""
+        """Log the means, and remember which step they are of."""
+        self.validated_step = self.global_step
+        self.validation_seconds = time.perf_counter() - self._validation_started
         summary = summarise(self.scores())
         self.log_dict({f"validation/{name}": value for name, value in summary["model"].items()})
         self.log("validation/above_baselines_db", better_than_baselines(summary), prog_bar=True)

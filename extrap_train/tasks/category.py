@@ -75,9 +75,9 @@ def run(config: TrainConfig) -> None:
     trainer = _trainer(config, folder, training)
     trainer.fit(training, data, ckpt_path=_newest(folder), weights_only=True)
     seconds["train"] = time.perf_counter() - started
-    started = time.perf_counter()
-    trainer.validate(training, data, verbose=False)
-    seconds["validate"] = time.perf_counter() - started
+    if training.validated_step != trainer.global_step:
+        trainer.validate(training, data, verbose=False)
+    seconds["validate"] = training.validation_seconds
     save_model(training.model, folder.model)
     training.scores().to_csv(folder.path / "validation.csv", index=False)
     draw(training.pictures(), folder.samples / "final.png")
