@@ -1,10 +1,7 @@
-"""`task=category`, the main job: data, training, validation, and the files that a run leaves."""
+"""`task=category`, the main job: data, training and validation of a category model."""
 
-import json
 import logging
-import math
 import os
-import shutil
 import time
 import warnings
 from pathlib import Path
@@ -12,14 +9,14 @@ from typing import Any, cast
 
 import lightning
 import torch
+from filelock import FileLock, Timeout
 from lightning.pytorch.loggers import TensorBoardLogger
 from rich.console import Console
-from rich.table import Table
 
 from extrap_train.config import TrainConfig
 from extrap_train.data.examples import ExampleReader
-from extrap_train.data.files import write_whole
 from extrap_train.data.module import PairModule
+from extrap_train.data.store import PreparedData
 from extrap_train.diffusion.callbacks import (
     AveragedWeights,
     EpochCheckpoints,
@@ -29,14 +26,14 @@ from extrap_train.diffusion.callbacks import (
     checkpoints,
 )
 from extrap_train.diffusion.checkpoint import save_model, start_weights
-from extrap_train.diffusion.evaluation import Distance, Prediction, summarise
+from extrap_train.diffusion.evaluation import Distance
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.errors import InputError
 from extrap_train.metrics import squeeze_lpips
-from extrap_train.pictures import contact_sheet, error_map, mark_holes
 from extrap_train.runs import RunFolder, open_run, provenance
 from extrap_train.tasks.prepare import prepare_category
+from extrap_train.tasks.results import Results, draw_views, is_finished, write_results
 
 
 def run(config: TrainConfig) -> None:
@@ -46,55 +43,65 @@ def run(config: TrainConfig) -> None:
     distance, missing = _lpips(config)
     model = _model(config)
     folder = open_run(config)
-    if config.resume and _finished(folder, config.trainer.steps):
-        console.print(f"already trained for {config.trainer.steps} steps: {folder.path}")
-        return
-    if not config.resume:
-        shutil.rmtree(folder.checkpoints, ignore_errors=True)
-        (folder.path / "metrics.csv").unlink(missing_ok=True)
+    try:
+        with FileLock(folder.path / ".lock", timeout=0):
+            if config.resume and is_finished(folder, config):
+                console.print(f"already trained for {config.trainer.steps} steps: {folder.path}")
+                return
+            _train(config, folder, model, distance, missing, console)
+    except Timeout:
+        raise InputError(
+            f"{folder.path}: another process is training this run; wait for it or give run=NAME"
+        ) from None
+
+
+def _train(
+    config: TrainConfig,
+    folder: RunFolder,
+    model: ExtrapolationModel,
+    distance: Distance | None,
+    missing: dict[str, str],
+    console: Console,
+) -> None:
     started = time.perf_counter()
-    prepared = [
+    prepared = _prepared(config)
+    seconds = {"prepare": time.perf_counter() - started}
+    data = _data_module(config, prepared)
+    training = CategoryTraining(model, config, _names(data), distance)
+    started = time.perf_counter()
+    trainer = _trainer(config, folder)
+    trainer.fit(training, data, ckpt_path=_newest(folder), weights_only=True)
+    seconds["train"] = time.perf_counter() - started
+    if training.validated_step != trainer.global_step:
+        trainer.validate(training, data, verbose=False)
+    seconds["validate"] = training.validation_seconds
+    if not trainer.is_global_zero:
+        return
+    save_model(training.model, folder.model)
+    results = Results(
+        scores=training.scores(),
+        shown=training.pictures(),
+        missing=missing,
+        seconds=seconds,
+        steps=trainer.global_step,
+        parameters=sum(p.numel() for p in training.model.parameters()),
+        provenance=provenance(config, {d.folder.name: d.manifest["key"] for d in prepared}),
+    )
+    write_results(results, config, folder, console)
+
+
+def _prepared(config: TrainConfig) -> list[PreparedData]:
+    return [
         prepare_category(
             member,
             config.data,
             config.depth,
             config.prep,
             output=Path(config.output),
-            workers=os.cpu_count() or 1,
+            workers=config.threads or len(os.sched_getaffinity(0)),
         )
         for member in config.category.members
     ]
-    seconds = {"prepare": time.perf_counter() - started}
-    readers = {
-        split: ExampleReader(prepared, split, config.model.references)
-        for split in ("train", "test")
-    }
-    data = _data_module(config, readers["train"], readers["test"])
-    training = CategoryTraining(model, config, _names(data), distance)
-    started = time.perf_counter()
-    trainer = _trainer(config, folder, training)
-    trainer.fit(training, data, ckpt_path=_newest(folder), weights_only=True)
-    seconds["train"] = time.perf_counter() - started
-    if training.validated_step != trainer.global_step:
-        trainer.validate(training, data, verbose=False)
-    seconds["validate"] = training.validation_seconds
-    save_model(training.model, folder.model)
-    training.scores().to_csv(folder.path / "validation.csv", index=False)
-    draw(training.pictures(), folder.samples / "final.png")
-    validation = summarise(training.scores())
-    summary = {
-        "validation": validation,
-        "missing": missing,
-        "seconds": seconds,
-        "steps": trainer.global_step,
-        "parameters": sum(p.numel() for p in training.model.parameters()),
-        "provenance": provenance(config, {d.folder.name: d.manifest["key"] for d in prepared}),
-    }
-    write_whole(folder.summary, (json.dumps(_without_nan(summary), indent=1) + "\n").encode())
-    console.print(_table(validation))
-    for name, reason in missing.items():
-        console.print(f"missing {name}: {reason}")
-    console.print(f"pictures: {folder.samples / 'final.png'}\nresult: {folder.path}")
 
 
 def _quieten_lightning() -> None:
@@ -102,12 +109,6 @@ def _quieten_lightning() -> None:
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", module="lightning")
     warnings.filterwarnings("ignore", message=".*(weights|pretrained).*", module="torchvision")
-
-
-def _finished(folder: RunFolder, steps: int) -> bool:
-    if not folder.summary.is_file():
-        return False
-    return int(json.loads(folder.summary.read_text())["steps"]) >= steps
 
 
 def _lpips(config: TrainConfig) -> tuple[Distance | None, dict[str, str]]:
@@ -126,9 +127,10 @@ def _model(config: TrainConfig) -> ExtrapolationModel:
     return model.to(memory_format=torch.channels_last)
 
 
-def _data_module(
-    config: TrainConfig, train: ExampleReader, validation: ExampleReader
-) -> PairModule:
+def _data_module(config: TrainConfig, prepared: list[PreparedData]) -> PairModule:
+    train, validation = (
+        ExampleReader(prepared, split, config.model.references) for split in ("train", "test")
+    )
     for split, reader in (("training", train), ("test", validation)):
         if not len(reader):
             raise InputError(
@@ -170,12 +172,10 @@ class _Pictures(lightning.Callback):
     ) -> None:
         assert isinstance(pl_module, CategoryTraining)
         if trainer.is_global_zero and not trainer.sanity_checking:
-            draw(pl_module.pictures(), self.folder / f"step-{trainer.global_step:08d}.png")
+            draw_views(pl_module.pictures(), self.folder / f"step-{trainer.global_step:08d}.png")
 
 
-def _trainer(
-    config: TrainConfig, folder: RunFolder, training: CategoryTraining
-) -> lightning.Trainer:
+def _trainer(config: TrainConfig, folder: RunFolder) -> lightning.Trainer:
     options = config.trainer
     newest = _newest(folder)
     resumed_step = int(Path(newest).stem.split("-")[1]) if newest else 0
@@ -206,35 +206,3 @@ def _trainer(
             EpochCheckpoints(folder.checkpoints),
         ],
     )
-
-
-def draw(prediction: Prediction, path: Path) -> None:
-    """Reference, warp, output, truth and error, a row per view."""
-    batch, images = prediction.batch, prediction.images
-    assert batch.warp is not None
-    contact_sheet(
-        {
-            "nearest photo": images["nearest"],
-            "warp": mark_holes(batch.warp.image, batch.warp.mask),
-            "inpainted": images["inpainted"],
-            "model": images["model"],
-            "truth": batch.image,
-            "error": error_map(images["model"], batch.image),
-        },
-        path,
-    )
-
-
-def _without_nan(value: Any) -> Any:
-    """JSON has no NaN: a mean over no view at all becomes null."""
-    if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
-    return None if isinstance(value, float) and math.isnan(value) else value
-
-
-def _table(validation: dict[str, dict[str, float]]) -> Table:
-    metrics = list(next(iter(validation.values())))
-    table = Table("", *metrics, title="held-out views")
-    for method, row in validation.items():
-        table.add_row(method, *(f"{row[metric]:.3f}" for metric in metrics))
-    return table
