@@ -1,0 +1,113 @@
+"""What a finished training run leaves behind: numbers, pictures and `summary.json`."""
+
+import io
+import json
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from rich.console import Console
+from rich.table import Table
+
+from extrap_train.config import TrainConfig
+from extrap_train.data.files import write_whole
+from extrap_train.diffusion.evaluation import Prediction, summarise
+from extrap_train.pictures import contact_sheet, curve, error_map, mark_holes
+from extrap_train.runs import RunFolder
+
+_ABOVE = "validation/above_baselines_db"
+
+
+@dataclass(frozen=True)
+class Results:
+    """What training and validation found."""
+
+    scores: pd.DataFrame
+    """A row per held-out view and method."""
+    shown: Prediction
+    """The views for the picture sheet."""
+    missing: dict[str, str]
+    """Metrics that could not be computed, with the reason."""
+    seconds: dict[str, float]
+    """Of the last session of the run: prepare, train, validate."""
+    steps: int
+    parameters: int
+    provenance: dict[str, Any]
+
+
+def is_finished(folder: RunFolder, config: TrainConfig) -> bool:
+    """Whether the summary is there for at least these steps and for this way of measuring."""
+    if not folder.summary.is_file():
+        return False
+    summary = json.loads(folder.summary.read_text())
+    same_measure = summary["provenance"]["validation"] == asdict(config.validation)
+    return same_measure and int(summary["steps"]) >= config.trainer.steps
+
+
+def write_results(
+    results: Results, config: TrainConfig, folder: RunFolder, console: Console
+) -> None:
+    """Write tables, pictures and, last of all, the summary that marks the run as finished."""
+    validation = summarise(results.scores)
+    text = io.StringIO()
+    results.scores.to_csv(text, index=False)
+    write_whole(folder.path / "validation.csv", text.getvalue().encode())
+    draw_views(results.shown, folder.samples / "final.png")
+    draw_curve(folder)
+    summary = {
+        "validation": validation,
+        "missing": results.missing,
+        "seconds": results.seconds,
+        "steps": results.steps,
+        "parameters": results.parameters,
+        "provenance": {**results.provenance, "validation": asdict(config.validation)},
+    }
+    write_whole(folder.summary, (json.dumps(_without_nan(summary), indent=1) + "\n").encode())
+    console.print(_table(validation))
+    for name, reason in results.missing.items():
+        console.print(f"missing {name}: {reason}")
+    console.print(f"pictures: {folder.samples / 'final.png'}\nresult: {folder.path}")
+
+
+def draw_views(prediction: Prediction, path: Path) -> None:
+    """Reference, warp, output, truth and error, a row per view."""
+    batch, images = prediction.batch, prediction.images
+    assert batch.warp is not None
+    contact_sheet(
+        {
+            "nearest photo": images["nearest"],
+            "warp": mark_holes(batch.warp.image, batch.warp.mask),
+            "inpainted": images["inpainted"],
+            "model": images["model"],
+            "truth": batch.image,
+            "error": error_map(images["model"], batch.image),
+        },
+        path,
+    )
+
+
+def draw_curve(folder: RunFolder) -> None:
+    """How far the model was above the best baseline, over the training steps."""
+    table = pd.read_csv(folder.path / "metrics.csv")
+    if _ABOVE in table:
+        rows = table[table[_ABOVE].notna()]
+        series = {"model": rows[_ABOVE].tolist(), "best baseline": [0.0] * len(rows)}
+        path = folder.samples / "curve.png"
+        curve(rows["step"].tolist(), series, "PSNR above the best baseline, dB", path)
+
+
+def _without_nan(value: Any) -> Any:
+    """JSON has no NaN: a mean over no view at all becomes null."""
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def _table(validation: dict[str, dict[str, float]]) -> Table:
+    metrics = list(next(iter(validation.values())))
+    table = Table("", *metrics, title="held-out views")
+    for method, row in validation.items():
+        table.add_row(method, *(f"{row[metric]:.3f}" for metric in metrics))
+    return table
