@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import logging
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +18,9 @@ from extrap_train.views import View, stack_cameras
 
 LEAST_KNOWN_SHARE = 0.25
 """Of the finer depths under a pixel, for it to have one."""
+MOST_UNUSABLE_SHARE = 0.1
+"""Of a sequence's frames, beyond which the whole sequence is not trusted."""
+LOG = logging.getLogger(__name__)
 
 
 def frames_key(sequence: Sequence, depth_source: DepthSource, image_size: int) -> str:
@@ -33,19 +37,19 @@ def frames_key(sequence: Sequence, depth_source: DepthSource, image_size: int) -
 def make_frames(sequence: Sequence, depth_source: DepthSource, image_size: int) -> SequenceFrames:
     """Read a sequence as squares around the object, with depth, at the store's size.
 
-    Raises InputError where a file cannot be used, no mask shows the object, or no depth is known
-    at all.
+    Frames whose files cannot be used are left out with a warning. Raises InputError where too many
+    are, no mask shows the object, or no depth is known at all.
     """
     finer = max(1, (depth_source.image_size or 0) // image_size)
-    views = [object_square(frame.load(), image_size * finer) for frame in sequence.frames]
     where = f"sequence {sequence.category}/{sequence.name}"
+    views = _usable_views(sequence, where, image_size * finer)
     if all(view.mask is not None and not view.mask.any() for view in views):
         raise InputError(f"{where}: the masks are all black; remove them or the sequence")
     maps = depth_source.depth_maps(views)
     depths = torch.stack([block_median(found.reliable(), finer) for found in maps])
     views = [replace(view, depth=None).resized(image_size, image_size) for view in views]
     frames = SequenceFrames(
-        names=tuple(frame.name for frame in sequence.frames),
+        names=tuple(view.name for view in views),
         camera=stack_cameras([view.camera for view in views]),
         images=np.stack([_to_bytes(view.image).transpose(1, 2, 0) for view in views]),
         depths=depths.numpy(force=True),
@@ -54,6 +58,21 @@ def make_frames(sequence: Sequence, depth_source: DepthSource, image_size: int) 
     if not frames.depths.any():
         raise InputError(f"{where}: no depth is known in any of its frames; use depth=stereo")
     return frames
+
+
+def _usable_views(sequence: Sequence, where: str, size: int) -> list[View]:
+    views, reasons = [], []
+    for frame in sequence.frames:
+        try:
+            views.append(replace(object_square(frame.load(), size), name=frame.name))
+        except InputError as error:
+            reasons.append(str(error))
+    if len(reasons) > MOST_UNUSABLE_SHARE * len(sequence.frames):
+        count = f"{len(reasons)} of {len(sequence.frames)} frames cannot be used"
+        raise InputError(f"{where}: {count}, the first because of {reasons[0]}")
+    if reasons:
+        LOG.warning("%s: %d frames left out: %s", where, len(reasons), reasons[0])
+    return views
 
 
 def object_square(view: View, size: int) -> View:

@@ -1,6 +1,6 @@
 """Cameras on orbits and captures made of them, in memory."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 import numpy as np
 import torch
@@ -53,14 +53,14 @@ def capture(
     name: str = "one",
     depth: float = 3.0,
     mask: Callable[[int], torch.Tensor | None] = lambda index: None,
-    broken: int | None = None,
+    broken: Collection[int] = (),
     **quality: float,
 ) -> Sequence:
     """A capture whose frame `i` is all of the grey `i / n`, at one depth."""
     count = len(camera.world_to_cam)
 
     def load(index: int) -> View:
-        if index == broken:
+        if index in broken:
             raise InputError(f"{name}/frame{index}.jpg: truncated; restore it")
         size = (camera.height, camera.width)
         grey, flat = torch.full((3, *size), index / count), torch.full(size, depth)

@@ -105,18 +105,28 @@ def test_two_runs_give_the_same_files(tmp_path: Path) -> None:
 
 
 def test_a_failing_sequence_is_reported_and_the_rest_goes_on(tmp_path: Path) -> None:
-    sequences = [*captures(3), capture(ring(even(24)), "bad", broken=4)]
+    sequences = [*captures(3), capture(ring(even(24)), "bad", broken=(4, 5, 6))]
     sequences += [capture(ring(even(24, 90)), "arc"), capture(ring(even(24)), "flat", depth=0.0)]
     black = lambda index: torch.zeros(48, 64)  # noqa: E731
     sequences += [capture(ring(even(24)), "black", mask=black)]
     data = run(tmp_path / "cup", sequences)
     reasons = data.sequences.set_index("sequence")["reason"]
-    assert reasons["cup/bad"] == "bad/frame4.jpg: truncated; restore it"
+    assert "3 of 24 frames cannot be used" in reasons["cup/bad"]
+    assert "bad/frame4.jpg: truncated; restore it" in reasons["cup/bad"]
     assert "covers 86°" in reasons["cup/arc"]
     assert "no depth is known" in reasons["cup/flat"]
     assert "masks are all black" in reasons["cup/black"]
     assert data.sequences["kept"].sum() == 3
     assert {pair.sequence for pair in data.pairs("train")} <= {f"cup/000{i}" for i in range(3)}
+
+
+def test_a_single_bad_frame_is_left_out_of_its_sequence(tmp_path: Path) -> None:
+    sequences = [*captures(3), capture(ring(even(24)), "one_bad", broken=(4,))]
+    data = run(tmp_path / "cup", sequences)
+    names = data.names("cup/one_bad")
+    assert len(names) == 23
+    assert "frame4" not in names
+    assert len(data.cameras("cup/one_bad").world_to_cam) == 23
 
 
 def test_nothing_left_sums_up_the_reasons(tmp_path: Path) -> None:
