@@ -21,7 +21,7 @@ def _run(config: DataPrepConfig) -> None:
             config.depth,
             config.prep,
             output=Path(config.output),
-            workers=config.workers or os.cpu_count() or 1,
+            workers=config.workers or len(os.sched_getaffinity(0)),
         )
         write_report(prepared, Console())
 

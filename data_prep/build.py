@@ -77,7 +77,7 @@ def _preparation_key(
     for sequence in sequences:
         qualities = [sequence.viewpoint_quality, sequence.point_cloud_quality]
         digest.update(json.dumps([sequence.category, sequence.name, qualities]).encode())
-        digest.update(frames_key(sequence, depth_source, options.image_size).encode())
+        digest.update(frames_key(sequence, depth_source, options.image_size, False).encode())
     return digest.hexdigest()
 
 
@@ -95,13 +95,19 @@ def _make_all(
 ) -> list[Outcome]:
     """Threads, not processes: decoding and depth release the interpreter lock."""
 
+    verdicts = judge_all(sequences, options)
+    kept = Counter(
+        s.category for s, verdict in zip(sequences, verdicts, strict=True) if verdict.kept
+    )
+
     def make(sequence: Sequence, verdict: Verdict) -> Outcome:
-        return _make(sequence, verdict, depth_source, options, folder)
+        lone = kept[sequence.category] == 1
+        return _make(sequence, verdict, depth_source, options, folder, lone)
 
     folder.mkdir(parents=True, exist_ok=True)
     with ThreadPoolExecutor(workers) as pool:
         done = tqdm(
-            pool.map(make, sequences, judge_all(sequences, options)),
+            pool.map(make, sequences, verdicts),
             "preparing",
             len(sequences),
             unit="sequence",
@@ -120,15 +126,16 @@ def _make(
     depth_source: DepthSource,
     options: PrepConfig,
     folder: Path,
+    lone: bool,
 ) -> Outcome:
     if not verdict.kept:
         return Outcome(sequence, verdict, None)
     target = frames_folder(folder, f"{sequence.category}/{sequence.name}")
-    key = frames_key(sequence, depth_source, options.image_size)
+    key = frames_key(sequence, depth_source, options.image_size, lone)
     cameras = read_camera_table(target, key)
     if cameras is None:
         try:
-            frames = make_frames(sequence, depth_source, options.image_size)
+            frames = make_frames(sequence, depth_source, options.image_size, lone)
         except InputError as error:
             failed = Verdict(
                 False, str(error), verdict.frames, verdict.gap_deg, verdict.coverage_deg

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from data_prep.split import held_out
 from extrap_train.data.frame_files import SequenceFrames
 from extrap_train.data.sequences import Sequence
 from extrap_train.depth import DepthSource
@@ -23,9 +24,9 @@ MOST_UNUSABLE_SHARE = 0.1
 LOG = logging.getLogger(__name__)
 
 
-def frames_key(sequence: Sequence, depth_source: DepthSource, image_size: int) -> str:
+def frames_key(sequence: Sequence, depth_source: DepthSource, image_size: int, lone: bool) -> str:
     """A hash of what frames are made from: options, names and cameras, not the files' bytes."""
-    digest = hashlib.sha256(json.dumps([image_size, repr(depth_source)]).encode())
+    digest = hashlib.sha256(json.dumps([image_size, repr(depth_source), lone]).encode())
     for frame in sequence.frames:
         traits = [frame.name, frame.camera.height, frame.camera.width, frame.has_depth]
         digest.update(json.dumps([*traits, frame.has_mask]).encode())
@@ -34,9 +35,13 @@ def frames_key(sequence: Sequence, depth_source: DepthSource, image_size: int) -
     return digest.hexdigest()
 
 
-def make_frames(sequence: Sequence, depth_source: DepthSource, image_size: int) -> SequenceFrames:
+def make_frames(
+    sequence: Sequence, depth_source: DepthSource, image_size: int, lone: bool
+) -> SequenceFrames:
     """Read a sequence as squares around the object, with depth, at the store's size.
 
+    The held-out frames of a `lone` sequence get no depth and lend none to the others: what is
+    tested on must not shape the references.
     Frames whose files cannot be used are left out with a warning. Raises InputError where too many
     are, no mask shows the object, or no depth is known at all.
     """
@@ -45,8 +50,11 @@ def make_frames(sequence: Sequence, depth_source: DepthSource, image_size: int) 
     views = _usable_views(sequence, where, image_size * finer)
     if all(view.mask is not None and not view.mask.any() for view in views):
         raise InputError(f"{where}: the masks are all black; remove them or the sequence")
-    maps = depth_source.depth_maps(views)
-    depths = torch.stack([block_median(found.reliable(), finer) for found in maps])
+    depths = torch.zeros(len(views), image_size, image_size)
+    helping = (~held_out(len(views)) if lone else np.ones(len(views), bool)).nonzero()[0]
+    maps = depth_source.depth_maps([views[i] for i in helping])
+    for index, found in zip(helping, maps, strict=True):
+        depths[index] = block_median(found.reliable(), finer)
     views = [replace(view, depth=None).resized(image_size, image_size) for view in views]
     frames = SequenceFrames(
         names=tuple(view.name for view in views),

@@ -7,7 +7,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrap_train.geometry.cameras import pixel_grid
-from extrap_train.views import Warp
 
 
 def coordinate_grid(
@@ -30,13 +29,3 @@ def positional_encoding(
     frequencies = math.pi * 2.0 ** torch.arange(octaves, device=coordinates.device)
     angle_rad = coordinates[:, None] * frequencies[:, None, None, None].to(coordinates.dtype)
     return torch.cat([angle_rad.sin(), angle_rad.cos()], 2).reshape(b, 4 * octaves, h, w)
-
-
-def warp_encoding(warp: Warp, octaves: int) -> Float[Tensor, "b {4*octaves} h w"]:
-    """Encode where in the nearest reference each query pixel comes from; zero where it comes from
-    nowhere.
-
-    The coordinates were warped and are encoded here: interpolated sines would be no encoding of a
-    coordinate.
-    """
-    return positional_encoding(warp.coordinates, octaves) * warp.nearest_mask[:, None]

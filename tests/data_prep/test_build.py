@@ -155,6 +155,16 @@ def test_a_lone_sequence_holds_frames_out(tmp_path: Path) -> None:
     assert not held & set(data.reference_frames("cup/0000").tolist())
 
 
+def test_held_out_photographs_lend_no_depth(tmp_path: Path) -> None:
+    """What is tested on must not shape the references: depth is estimated without it."""
+    depth = CountingDepth(calls=([],))
+    data = run(tmp_path / "cup", captures(1), depth=depth)
+    assert depth.calls[0] == [20], "24 frames, of which every fifth (4) is held out"
+    (sequence,) = data.sequences["sequence"]
+    _, depths, _ = data.frames(sequence, list(range(24)))
+    assert [i for i in range(24) if not depths[i].any()] == [4, 9, 14, 19]
+
+
 def test_a_frame_without_depth_is_no_reference(tmp_path: Path) -> None:
     sequences = captures(2)
     frame = sequences[0].frames[6]
