@@ -164,7 +164,7 @@ class SamplerConfig:
 class TrainerConfig:
     """How long, how often, on what."""
 
-    steps: int = 3000
+    steps: int = 1200
     batch_size: int = 16
     warmup_steps: int = 100
     condition_dropout: float = 0.05
@@ -175,7 +175,7 @@ class TrainerConfig:
     devices: int = 1
     checkpoint_every: int = 200
     """Steps; a killed run loses at most this many."""
-    validate_every: int = 1000
+    validate_every: int = 400
     workers: int = 0
     """Processes that load batches beside the training process."""
 

@@ -77,6 +77,22 @@ class EpochCheckpoints(Callback):
             for old in checkpoints(self.folder)[:-_KEPT]:
                 old.unlink()
 
+    def on_load_checkpoint(
+        self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Say that the saved epoch was over.
+
+        Lightning counts an epoch as unfinished while its end's callbacks run; resumed with a limit
+        of steps, it would insert an epoch of a single batch.
+        """
+        progress = checkpoint["loops"]["fit_loop"]
+        for span in ("total", "current"):
+            epoch = progress["epoch_progress"][span]
+            epoch["completed"] = epoch["processed"]
+        batches = progress["epoch_loop.batch_progress"]
+        batches["current"] = dict.fromkeys(batches["current"], 0)
+        batches["is_last_batch"] = False
+
 
 def checkpoints(folder: Path) -> list[Path]:
     """Complete checkpoints, oldest first."""

@@ -79,7 +79,8 @@ class CategoryTraining(lightning.LightningModule):
             (self.config.seed * 2**20 + self.global_step) * 64 + self.global_rank
         )
         loss = diffusion_loss(self.model, batch, generator, self.config.trainer.condition_dropout)
-        self.log("loss", loss, prog_bar=True)
+        self.log("loss", loss)
+        self.log("step", float(self.global_step + 1))  # Lightning's own count shifts on resume
         return loss
 
     def validation_step(self, batch: PairBatch, batch_idx: int) -> None:
@@ -98,7 +99,8 @@ class CategoryTraining(lightning.LightningModule):
         self.validation_seconds = time.perf_counter() - self._validation_started
         summary = summarise(self.scores())
         self.log_dict({f"validation/{name}": value for name, value in summary["model"].items()})
-        self.log("validation/above_baselines_db", better_than_baselines(summary), prog_bar=True)
+        self.log("validation/above_baselines_db", better_than_baselines(summary))
+        self.log("step", float(self.global_step))
 
     def scores(self) -> pd.DataFrame:
         """Scores of the last validation, a row per view and method."""
