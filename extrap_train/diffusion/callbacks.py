@@ -139,7 +139,7 @@ class MetricsTable(Logger):
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         """Collect a row; rows of the same step are one."""
-        row = {name: f"{value:.6g}" for name, value in metrics.items() if name != "epoch"}
+        row = {name: f"{value:.6g}" for name, value in metrics.items()}
         if self._rows and self._rows[-1]["step"] == str(step):
             self._rows[-1] |= row
         else:

@@ -24,6 +24,9 @@ from extrap_train.diffusion.evaluation import (
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.views import PairBatch
 
+_STEPS_A_ROW = 20
+"""Of `metrics.csv` between two validations."""
+
 
 def diffusion_loss(
     model: ExtrapolationModel,
@@ -79,9 +82,13 @@ class CategoryTraining(lightning.LightningModule):
             (self.config.seed * 2**20 + self.global_step) * 64 + self.global_rank
         )
         loss = diffusion_loss(self.model, batch, generator, self.config.trainer.condition_dropout)
-        self.log("loss", loss)
-        self.log("step", float(self.global_step + 1))  # Lightning's own count shifts on resume
+        self.log("loss", loss, logger=False)
         return loss
+
+    def on_train_batch_end(self, outputs: object, batch: PairBatch, batch_idx: int) -> None:
+        """Record the loss now and then."""
+        if self.global_step % _STEPS_A_ROW == 0:
+            self._record({"loss": float(self.trainer.callback_metrics["loss"])})
 
     def validation_step(self, batch: PairBatch, batch_idx: int) -> None:
         """Sample the batch's queries."""
@@ -98,9 +105,16 @@ class CategoryTraining(lightning.LightningModule):
         self.validated_step = self.global_step
         self.validation_seconds = time.perf_counter() - self._validation_started
         summary = summarise(self.scores())
-        self.log_dict({f"validation/{name}": value for name, value in summary["model"].items()})
-        self.log("validation/above_baselines_db", better_than_baselines(summary))
-        self.log("step", float(self.global_step))
+        metrics = {f"validation/{name}": value for name, value in summary["model"].items()}
+        metrics["validation/above_baselines_db"] = better_than_baselines(summary)
+        self.log_dict(metrics, logger=False)
+        self._record(metrics)
+
+    def _record(self, metrics: dict[str, float]) -> None:
+        """Log under the true step: the count that Lightning logs by shifts when a run resumes."""
+        for logger in self.loggers if self.trainer.is_global_zero else ():
+            logger.log_metrics(metrics, self.global_step)
+            logger.save()
 
     def scores(self) -> pd.DataFrame:
         """Scores of the last validation, a row per view and method."""

@@ -192,7 +192,6 @@ def _trainer(config: TrainConfig, folder: RunFolder) -> lightning.Trainer:
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
-        log_every_n_steps=20,
         deterministic="warn",
         logger=[
             MetricsTable(folder.path / "metrics.csv", resumed_step),

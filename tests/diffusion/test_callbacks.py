@@ -18,7 +18,7 @@ from extrap_train.errors import InputError
 
 def test_rows_of_one_step_are_one_row_and_new_columns_are_added(tmp_path: Path) -> None:
     table = MetricsTable(tmp_path / "metrics.csv", 0)
-    table.log_metrics({"loss": 1.0, "epoch": 0}, 20)
+    table.log_metrics({"loss": 1.0}, 20)
     table.log_metrics({"psnr": 2.0}, 20)
     table.log_metrics({"loss": 0.5}, 40)
     table.save()
