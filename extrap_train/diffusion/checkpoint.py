@@ -89,7 +89,10 @@ def load_weights(model: ExtrapolationModel, folder: Path) -> None:
             ) from None
         except RuntimeError as error:
             reason = " ".join(str(error).split())[:300]
-            raise InputError(f"{path}: does not fit the configured model: {reason}") from None
+            raise InputError(
+                f"{path}: does not fit the configured model; give the options it was trained with, "
+                f"or model.start=null: {reason}"
+            ) from None
 
 
 def start_weights(model: ExtrapolationModel, start: str | None) -> None:
