@@ -154,7 +154,7 @@ class ModelConfig:
 class SamplerConfig:
     """How a view is sampled (DDIM)."""
 
-    steps: int = 8
+    steps: int = 2
     eta: float = 0.0
     guidance: float = 1.0
     """Weight of the conditional prediction against the null condition's; 1 is no guidance."""
