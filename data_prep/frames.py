@@ -12,6 +12,7 @@ from torch import Tensor
 
 from data_prep.split import held_out
 from extrap_train.data.frame_files import SequenceFrames
+from extrap_train.data.images import to_eight_bits
 from extrap_train.data.sequences import Sequence
 from extrap_train.depth import DepthSource
 from extrap_train.errors import InputError
@@ -59,9 +60,9 @@ def make_frames(
     frames = SequenceFrames(
         names=tuple(view.name for view in views),
         camera=stack_cameras([view.camera for view in views]),
-        images=np.stack([_to_bytes(view.image).transpose(1, 2, 0) for view in views]),
+        images=np.stack([to_eight_bits(view.image).transpose(1, 2, 0) for view in views]),
         depths=depths.numpy(force=True),
-        masks=np.stack([_to_bytes(_mask(view)) for view in views]),
+        masks=np.stack([to_eight_bits(_mask(view)) for view in views]),
     )
     if not frames.depths.any():
         raise InputError(f"{where}: no depth is known in any of its frames; use depth=stereo")
@@ -116,7 +117,3 @@ def block_median(depth: Float[Tensor, "h w"], side: int) -> Float[Tensor, "h2 w2
     known = blocks.isfinite() & (blocks > 0)
     median = torch.where(known, blocks, torch.nan).nanmedian(-1).values
     return torch.where(known.float().mean(-1) >= LEAST_KNOWN_SHARE, median, 0)
-
-
-def _to_bytes(values: Float[Tensor, "*n"]) -> np.ndarray:
-    return (values.clamp(0, 1) * 255).round().byte().numpy(force=True)

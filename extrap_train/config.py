@@ -103,9 +103,7 @@ class PrepConfig:
     near_duplicate_deg: float = 6.0
     """A pair is skipped if a chosen one has both its frames within this angle of its own."""
     full_circle: str = "prefer"
-    """`require` drops what is no full circle, `prefer` does unless nothing is one, `ignore` keeps
-    it.
-    """
+    """No full circle: `require` drops it, `prefer` unless nothing is one, `ignore` never."""
 
 
 NORM_GROUPS = 16
@@ -145,9 +143,7 @@ class ModelConfig:
     learning_rate: float = 3e-4
     weight_decay: float = 0.01
     start: str | None = None
-    """Folder of the model that training starts from; `base` is the one in the package; null is
-    random.
-    """
+    """Folder that training starts from; `base` is the packaged model, null random weights."""
 
 
 @dataclass

@@ -25,8 +25,7 @@ _NOT_PART_OF_THE_RUN = (
     "validation",
     "trainer.steps",
 )
-"""Keys that may differ on resume: where things lie, how they are measured, and a longer training.
-"""
+"""May differ on resume: where things lie, how they are measured, how long is trained."""
 
 _LATEST = "latest"
 """Link to the newest run of a model and category."""

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from extrap_train.data.co3d import FRAME_ANNOTATIONS, SEQUENCE_ANNOTATIONS
 from extrap_train.data.files import write_whole
+from extrap_train.data.images import to_eight_bits
 from extrap_train.geometry.pytorch3d import viewpoint_from_camera
 from extrap_train.views import Camera, View
 
@@ -111,7 +112,7 @@ def _write_depth(root: Path, folder: str, stem: str, depth: Float[Tensor, "h w"]
 
 def _write_mask(root: Path, folder: str, stem: str, mask: Float[Tensor, "h w"]) -> dict[str, Any]:
     path = f"{folder}/masks/{stem}.png"
-    write_whole(root / path, _png(Image.fromarray(_to_bytes(mask))))
+    write_whole(root / path, _png(Image.fromarray(to_eight_bits(mask))))
     return {"path": path, "mass": float(mask.sum())}
 
 
@@ -136,7 +137,7 @@ def _viewpoint(camera: Camera) -> dict[str, Any]:
 
 def _jpeg(image: Float[Tensor, "3 h w"]) -> bytes:
     content = io.BytesIO()
-    picture = Image.fromarray(_to_bytes(image.permute(1, 2, 0)))
+    picture = Image.fromarray(to_eight_bits(image.permute(1, 2, 0)))
     # subsampling=0 is 4:4:4: halved chroma would bleed across the edges that warps are judged by.
     picture.save(content, "JPEG", quality=JPEG_QUALITY, subsampling=0)
     return content.getvalue()
@@ -159,11 +160,7 @@ def _ply(points: Float[Tensor, "n 3"], colors: Float[Tensor, "n 3"]) -> bytes:
     for index, axis in enumerate("xyz"):
         vertices[axis] = points[:, index].cpu().numpy()
     for index, name in enumerate(("red", "green", "blue")):
-        vertices[name] = _to_bytes(colors[:, index])
+        vertices[name] = to_eight_bits(colors[:, index])
     content = io.BytesIO()
     PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(content)
     return content.getvalue()
-
-
-def _to_bytes(values: Float[Tensor, "..."]) -> np.ndarray:
-    return values.detach().cpu().clamp(0, 1).mul(255).round().to(torch.uint8).numpy()

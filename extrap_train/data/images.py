@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Float, Shaped, UInt8
 from PIL import Image
 from torch import Tensor
 
@@ -29,6 +29,11 @@ def read_image(path: Path, size: tuple[int, int]) -> Float[Tensor, "3 h w"]:
     """A photograph of `size` (height, width), colours in [0, 1]."""
     pixels = _decode(path, size, _EIGHT_BIT_MODES, "RGB")
     return torch.from_numpy(pixels).permute(2, 0, 1).contiguous().float().div_(255)
+
+
+def to_eight_bits(values: Float[Tensor, "..."]) -> UInt8[np.ndarray, "..."]:
+    """Values in [0, 1], those beyond clipped, as bytes."""
+    return values.detach().cpu().clamp(0, 1).mul(255).round().to(torch.uint8).numpy()
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> Float[Tensor, "h w"]:

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrap_train.config import SamplerConfig
+from extrap_train.data.module import spread
 from extrap_train.diffusion.baselines import inpainted_warp, mean_filled_warp, nearest_reference
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sample_views, view_generator
@@ -95,7 +96,7 @@ def better_than_baselines(summary: dict[str, dict[str, float]]) -> float:
 def first_views(predictions: list[Prediction], count: int) -> Prediction:
     """`count` views spread evenly over the predictions, as one, for pictures."""
     total = sum(len(p.names) for p in predictions)
-    chosen = torch.linspace(0, total - 1, min(count, total)).round().long()
+    chosen = torch.tensor(spread(total, count))
     names = [name for p in predictions for name in p.names]
     return Prediction(
         combine([p.batch for p in predictions], lambda tensors: torch.cat(list(tensors))[chosen]),
