@@ -1,0 +1,43 @@
+"""The configuration tree as plain dataclasses: every option, its type, its unit and its bounds.
+
+Light on purpose (no torch), so that `--help` is instant. YAMLs under `conf/` choose among the
+variants of a group; this package says what may stand in them.
+"""
+
+from extrap_train.config.checks import validate
+from extrap_train.config.commands import DataPrepConfig, TrainConfig
+from extrap_train.config.data import (
+    CATEGORIES,
+    CategoryConfig,
+    Co3dConfig,
+    DataConfig,
+    PrepConfig,
+    SyntheticConfig,
+)
+from extrap_train.config.depth import DatasetDepthConfig, DepthConfig, StereoConfig
+from extrap_train.config.model import NORM_GROUPS, ModelConfig, SamplerConfig, UNetConfig
+from extrap_train.config.training import TrainerConfig, ValidationConfig
+from extrap_train.config.tree import MISSING, dotted
+
+__all__ = [
+    "CATEGORIES",
+    "MISSING",
+    "NORM_GROUPS",
+    "CategoryConfig",
+    "Co3dConfig",
+    "DataConfig",
+    "DataPrepConfig",
+    "DatasetDepthConfig",
+    "DepthConfig",
+    "ModelConfig",
+    "PrepConfig",
+    "SamplerConfig",
+    "StereoConfig",
+    "SyntheticConfig",
+    "TrainConfig",
+    "TrainerConfig",
+    "UNetConfig",
+    "ValidationConfig",
+    "dotted",
+    "validate",
+]

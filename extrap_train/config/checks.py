@@ -1,0 +1,112 @@
+"""What types cannot say of options: ranges, known words, values that exclude each other."""
+
+import math
+from dataclasses import asdict
+
+from extrap_train.config.commands import DataPrepConfig, TrainConfig
+from extrap_train.config.data import Co3dConfig, PrepConfig
+from extrap_train.config.model import NORM_GROUPS, ModelConfig
+from extrap_train.config.tree import dotted
+from extrap_train.errors import InputError
+
+_PRECISIONS = ("32-true", "bf16-mixed", "16-mixed", "bf16-true", "16-true", "64-true")
+
+_BOUNDS: dict[str, tuple[float, float]] = {
+    "seed": (0, 2**30),
+    "threads": (1, math.inf),
+    "workers": (1, math.inf),
+    "data.test_sequences": (1, 10_000),
+    "data.train_sequences": (1, 10_000),
+    "data.frames": (2, 10_000),
+    "data.image_size": (8, 8192),
+    "data.seed": (0, 2**30),
+    "depth.planes": (2, 4096),
+    "depth.neighbours": (1, 64),
+    "depth.image_size": (16, 8192),
+    "prep.image_size": (1, 4096),
+    "prep.max_uses": (1, math.inf),
+    "model.patch": (1, 64),
+    "model.references": (1, 16),
+    "model.octaves": (1, 16),
+    "model.unet.layers_per_block": (1, 16),
+    "model.unet.heads": (1, 64),
+    "model.unet.token_width": (1, 8192),
+    "sampler.steps": (1, 1000),
+    "sampler.eta": (0, 1),
+    "trainer.steps": (1, math.inf),
+    "trainer.batch_size": (1, math.inf),
+    "trainer.warmup_steps": (0, math.inf),
+    "trainer.condition_dropout": (0, 1),
+    "trainer.ema_decay": (0, 1),
+    "trainer.devices": (1, math.inf),
+    "trainer.checkpoint_every": (1, math.inf),
+    "trainer.validate_every": (1, math.inf),
+    "trainer.workers": (0, 1024),
+    "validation.examples": (1, math.inf),
+    "validation.batch_size": (1, math.inf),
+    "validation.pictures": (1, math.inf),
+}
+"""Least and greatest value of every number whose range its type does not say."""
+
+
+def validate(config: TrainConfig | DataPrepConfig, tasks: tuple[str, ...]) -> None:
+    """Check what types cannot say; raises InputError with option, value and remedy."""
+    _check_bounds(config)
+    _check_prep(config.prep)
+    if isinstance(config.data, Co3dConfig) and not config.data.root:
+        raise InputError("data=co3d needs the folder of the download: give data.root=FOLDER")
+    if isinstance(config, TrainConfig):
+        _check_one_of("task", config.task, tasks)
+        _check_one_of("trainer.precision", config.trainer.precision, _PRECISIONS)
+        _check_model(config.model, config.prep)
+
+
+def _check_bounds(config: TrainConfig | DataPrepConfig) -> None:
+    for name, value in dotted(asdict(config)).items():
+        least, greatest = _BOUNDS.get(name, (-math.inf, math.inf))
+        if not isinstance(value, int | float) or least <= value <= greatest:
+            continue
+        if greatest == math.inf:
+            raise InputError(f"{name}={value}: must be at least {least:g}")
+        raise InputError(f"{name}={value}: must be from {least:g} to {greatest:g}")
+
+
+def _check_prep(prep: PrepConfig) -> None:
+    _check_one_of("prep.full_circle", prep.full_circle, ("require", "prefer", "ignore"))
+    if not 0 <= prep.min_pair_angle_deg < prep.max_pair_angle_deg <= 90:
+        raise InputError(
+            f"prep.min_pair_angle_deg={prep.min_pair_angle_deg} and "
+            f"prep.max_pair_angle_deg={prep.max_pair_angle_deg}: need 0 ≤ min < max ≤ 90"
+        )
+
+
+def _check_model(model: ModelConfig, prep: PrepConfig) -> None:
+    _check_one_of("model.prediction", model.prediction, ("epsilon", "v_prediction", "sample"))
+    if model.image_size != prep.image_size:
+        raise InputError(
+            f"model.image_size={model.image_size} but "
+            f"prep.image_size={prep.image_size}: give both the same"
+        )
+    odd = [width for width in model.unet.channels if width <= 0 or width % NORM_GROUPS]
+    if odd or not model.unet.channels:
+        raise InputError(
+            f"model.unet.channels={model.unet.channels}: need multiples of {NORM_GROUPS}"
+        )
+    coarsest = model.patch * 2 ** (len(model.unet.channels) - 1)
+    if model.image_size % coarsest:
+        raise InputError(
+            f"model.image_size={model.image_size} is no multiple of {coarsest}, "
+            "which model.patch and the levels of model.unet.channels need"
+        )
+    if len(model.unet.channels) != len(model.unet.attention_levels):
+        raise InputError("model.unet.channels and model.unet.attention_levels differ in length")
+    if model.zero_terminal_snr and model.prediction == "epsilon":
+        raise InputError(
+            "model.prediction=epsilon says nothing at zero terminal SNR: "
+            "give model.zero_terminal_snr=false"
+        )
+
+
+def _check_one_of(name: str, value: str, known: tuple[str, ...]) -> None:
+    if value not in known:
+        raise InputError(f"{name}={value} is unknown; known: {', '.join(known)}")

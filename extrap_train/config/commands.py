@@ -1,0 +1,46 @@
+"""The whole tree of each command."""
+
+from dataclasses import dataclass, field
+
+from extrap_train.config.data import CategoryConfig, DataConfig, PrepConfig
+from extrap_train.config.depth import DepthConfig
+from extrap_train.config.model import ModelConfig, SamplerConfig
+from extrap_train.config.training import TrainerConfig, ValidationConfig
+from extrap_train.config.tree import MISSING
+
+
+@dataclass
+class TrainConfig:
+    """The whole tree of `python -m extrap_train`."""
+
+    category: CategoryConfig = MISSING
+    data: DataConfig = MISSING
+    depth: DepthConfig = MISSING
+    model: ModelConfig = MISSING
+    prep: PrepConfig = field(default_factory=PrepConfig)
+    sampler: SamplerConfig = field(default_factory=SamplerConfig)
+    trainer: TrainerConfig = field(default_factory=TrainerConfig)
+    validation: ValidationConfig = field(default_factory=ValidationConfig)
+    task: str = "category"
+    seed: int = 0
+    run: str | None = None
+    """Name of the run's folder; by default made from the configuration, so that the same command
+    resumes.
+    """
+    resume: bool = True
+    output: str = "outputs"
+    threads: int | None = None
+    """CPU threads; null takes every core."""
+
+
+@dataclass
+class DataPrepConfig:
+    """The whole tree of `python -m data_prep`."""
+
+    category: CategoryConfig = MISSING
+    data: DataConfig = MISSING
+    depth: DepthConfig = MISSING
+    prep: PrepConfig = field(default_factory=PrepConfig)
+    output: str = "outputs"
+    workers: int | None = None
+    """Sequences that are rendered or prepared at a time; null takes every core."""

@@ -1,0 +1,34 @@
+"""How a model is trained, and what it is measured on."""
+
+from dataclasses import dataclass
+
+
+@dataclass
+class TrainerConfig:
+    """How long, how often, on what."""
+
+    steps: int = 1200
+    batch_size: int = 16
+    warmup_steps: int = 100
+    condition_dropout: float = 0.05
+    """Share of the training examples whose condition is the null condition."""
+    ema_decay: float = 0.999
+    precision: str = "bf16-mixed"
+    accelerator: str = "auto"
+    devices: int = 1
+    checkpoint_every: int = 200
+    """Steps; a killed run loses at most this many."""
+    validate_every: int = 400
+    workers: int = 0
+    """Processes that load batches beside the training process."""
+
+
+@dataclass
+class ValidationConfig:
+    """What the trained model is measured on: held-out sequences."""
+
+    examples: int = 60
+    batch_size: int = 20
+    pictures: int = 8
+    lpips_weights: str | None = None
+    """A full `lpips.LPIPS(net="squeeze")` state dict; null takes torchvision's cached backbone."""
