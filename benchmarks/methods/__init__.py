@@ -1,0 +1,1 @@
+"""The methods that a table compares, one file a method, all behind `base.Method`."""

@@ -1,0 +1,47 @@
+"""What needs no training: the rows that a trained method has to beat."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis
+from benchmarks.methods.references import input_depths, nearest_inputs, warped_batch
+from extrap_train.diffusion.baselines import inpainted_warp
+
+
+@dataclass(frozen=True)
+class NearestPhoto:
+    """The input photograph nearest to the target, as it is."""
+
+    def weight_files(self) -> Sequence[Path]:
+        """None."""
+        return ()
+
+    def synthesize(self, inputs: SceneInputs) -> Synthesis:
+        """The nearest input's image for every target."""
+        with Stopwatch() as watch:
+            chosen = [inputs.views[row[0]].image for row in nearest_inputs(inputs, 1)]
+            images = torch.stack(chosen)
+        return Synthesis(images, watch.seconds / len(images), {"depth": "not used"})
+
+
+@dataclass(frozen=True)
+class InpaintedWarp:
+    """The fused warp of the nearest inputs, its holes inpainted (Telea 2004)."""
+
+    references: int = 3
+    """Most inputs that a target is warped from."""
+
+    def weight_files(self) -> Sequence[Path]:
+        """None."""
+        return ()
+
+    def synthesize(self, inputs: SceneInputs) -> Synthesis:
+        """Warp and inpaint every target."""
+        with Stopwatch() as watch:
+            batch = warped_batch(inputs, input_depths(inputs), self.references)
+            assert batch.warp is not None
+            images = inpainted_warp(batch.warp).clamp(0, 1)
+        return Synthesis(images, watch.seconds / len(images))
