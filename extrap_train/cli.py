@@ -30,6 +30,7 @@ _GROUPS: dict[str, list[type]] = {
     "category": [schema.CategoryConfig],
     "data": [schema.SyntheticConfig, schema.Co3dConfig],
     "depth": [schema.DatasetDepthConfig, schema.StereoConfig],
+    "matcher": [schema.FlowMatcherConfig],
     "model": [schema.ModelConfig],
 }
 

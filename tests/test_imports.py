@@ -14,6 +14,7 @@ _RANK = {
     "extrap_train.views": 1,
     "extrap_train.geometry": 2,
     "extrap_train.depth": 3,
+    "extrap_train.matching": 3,
     "extrap_train.data": 3,
     "extrap_train.metrics": 3,
     "extrap_train.pictures": 4,

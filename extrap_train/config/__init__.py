@@ -15,6 +15,7 @@ from extrap_train.config.data import (
     SyntheticConfig,
 )
 from extrap_train.config.depth import DatasetDepthConfig, DepthConfig, StereoConfig
+from extrap_train.config.matching import FlowMatcherConfig, MatcherConfig
 from extrap_train.config.model import NORM_GROUPS, ModelConfig, SamplerConfig, UNetConfig
 from extrap_train.config.training import TrainerConfig, ValidationConfig
 from extrap_train.config.tree import MISSING, dotted
@@ -29,6 +30,8 @@ __all__ = [
     "DataPrepConfig",
     "DatasetDepthConfig",
     "DepthConfig",
+    "FlowMatcherConfig",
+    "MatcherConfig",
     "ModelConfig",
     "PrepConfig",
     "SamplerConfig",

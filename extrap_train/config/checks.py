@@ -23,6 +23,7 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "depth.planes": (2, 4096),
     "depth.neighbours": (1, 64),
     "depth.image_size": (16, 8192),
+    "matcher.image_size": (16, 8192),
     "prep.image_size": (1, 4096),
     "prep.max_uses": (1, math.inf),
     "model.patch": (1, 64),

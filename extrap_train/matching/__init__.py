@@ -1,0 +1,99 @@
+"""Matchers behind one protocol: which points of two pictures show the same thing.
+
+A matcher is added with one file here and one YAML under `conf/matcher/`. Pixels are (u, v) with
+centres at +0.5, as everywhere; a flow says where a pixel of the *first* picture went in the
+*second*.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from extrap_train.geometry.cameras import pixel_grid
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Points of the first picture and where they are in the second; pixels (u, v)."""
+
+    first: Float[Tensor, "n 2"]
+    second: Float[Tensor, "n 2"]
+    confidence: Float[Tensor, "n"]
+    """In (0, 1]. Ranks matches of one matcher; is no probability, nor comparable between two."""
+
+    @property
+    def first_to_second(self) -> Float[Tensor, "n 2"]:
+        """How far, in pixels, each point went."""
+        return self.second - self.first
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return len(self.confidence)
+
+    def __getitem__(self, index: Bool[Tensor, "n"] | Tensor | slice) -> "Matches":
+        """Those at `index`."""
+        return Matches(self.first[index], self.second[index], self.confidence[index])
+
+
+@dataclass(frozen=True)
+class DenseFlow:
+    """For every pixel of the first picture, how far away it is in the second."""
+
+    first_to_second: Float[Tensor, "h w 2"]
+    """(u, v) in pixels, finite everywhere; means nothing where the confidence is 0."""
+    confidence: Float[Tensor, "h w"]
+    """In [0, 1]; 0 where the pixel is unknown, hidden, outside, or contradicted on the way back."""
+
+    def matches(self, stride: int = 1, least_confidence: float = 0.0) -> Matches:
+        """The pixels that are surer than `least_confidence`, of every `stride`-th row and column.
+
+        The lattice starts in its cells' middles, so that no side of the picture is preferred.
+        """
+        height, width = self.confidence.shape
+        grid = pixel_grid(height, width, self.confidence.device)
+        cells = (slice(stride // 2, None, stride), slice(stride // 2, None, stride))
+        confidence = self.confidence[cells]
+        sure = confidence > least_confidence
+        first = grid[cells][sure].to(self.first_to_second.dtype)
+        return Matches(first, first + self.first_to_second[cells][sure], confidence[sure])
+
+
+@runtime_checkable
+class Matcher(Protocol):
+    """Finds matches between two pictures."""
+
+    def match(
+        self,
+        first: Float[Tensor, "3 h w"],
+        second: Float[Tensor, "3 h2 w2"],
+        first_known: Bool[Tensor, "h w"] | None = None,
+    ) -> Matches:
+        """Matches from `first` to `second`, colours in [0, 1]; none is an answer, too.
+
+        `first_known` is False where `first` has a hole: no match starts there.
+        """
+        ...
+
+
+@runtime_checkable
+class DenseMatcher(Matcher, Protocol):
+    """A matcher that knows every pixel's way."""
+
+    def flow(
+        self,
+        first: Float[Tensor, "3 h w"],
+        second: Float[Tensor, "3 h2 w2"],
+        first_known: Bool[Tensor, "h w"] | None = None,
+    ) -> DenseFlow:
+        """Where each pixel of `first` is in `second`, colours in [0, 1]."""
+        ...
+
+
+def known_at(known: Bool[Tensor, "h w"], pixels: Float[Tensor, "n 2"]) -> Bool[Tensor, "n"]:
+    """Whether the pixel that holds each point is known; False outside the picture."""
+    height, width = known.shape
+    u, v = pixels.floor().long().unbind(-1)
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    return inside & known[v.clamp(0, height - 1), u.clamp(0, width - 1)]

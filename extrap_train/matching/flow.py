@@ -1,0 +1,137 @@
+"""A dense matcher without weights: dense inverse search (Kroeger et al., ECCV 2016) from OpenCV,
+there and back.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+from torch.nn import functional
+
+from extrap_train.config import FlowMatcherConfig
+from extrap_train.geometry.cameras import pixel_grid
+from extrap_train.geometry.fill import fill_holes
+from extrap_train.matching import DenseFlow, Matches
+from extrap_train.matching.likeness import windowed_correlation
+
+LARGEST_ENLARGEMENT = 2.0
+"""Enlarged twice, small pictures are matched to about a tenth of a pixel; more brings nothing."""
+LARGEST_ERROR = 2.0
+"""Forward-backward error, in pixels, from which both directions contradict each other."""
+LEAST_SIDE = 16
+"""Smaller pictures have no room for the search's patches, and are padded."""
+LUMA = (0.299, 0.587, 0.114)
+"""Weights of the colours in a grey picture (Rec. 601)."""
+
+
+@dataclass(frozen=True)
+class FlowMatcher:
+    """Coarse to fine, robust to exposure, for displacements of up to about a tenth of the picture.
+
+    Confidence is how alike the windows around both ends are (zero-mean normalised correlation, 0
+    without texture) times exp(−e²/2), e the forward-backward error in pixels.
+    """
+
+    config: FlowMatcherConfig
+
+    def match(
+        self,
+        first: Float[Tensor, "3 h w"],
+        second: Float[Tensor, "3 h2 w2"],
+        first_known: Bool[Tensor, "h w"] | None = None,
+    ) -> Matches:
+        """Every pixel of `first` whose way is confirmed on the way back."""
+        return self.flow(first, second, first_known).matches()
+
+    def flow(
+        self,
+        first: Float[Tensor, "3 h w"],
+        second: Float[Tensor, "3 h2 w2"],
+        first_known: Bool[Tensor, "h w"] | None = None,
+    ) -> DenseFlow:
+        """Where each pixel of `first` is in `second`; the result lies where `first` does."""
+        colours, there = (image.detach().float().cpu() for image in (first, second))
+        known = torch.ones_like(colours[0]) if first_known is None else first_known.float().cpu()
+        filled = fill_holes(colours[None], known[None])[0]
+        forward, backward = self._both_ways(grey(filled), grey(there))
+        found, inside = _sample(torch.cat([there, backward]), forward)
+        error = (forward + found[3:]).norm(dim=0)
+        likeness = windowed_correlation(filled, found[:3], known)
+        sure = inside & (known > 0) & (error < LARGEST_ERROR)
+        confidence = torch.where(sure, likeness * (-error.square() / 2).exp(), 0)
+        return DenseFlow(forward.permute(1, 2, 0).to(first), confidence.to(first))
+
+    def _both_ways(
+        self, first: Float[Tensor, "h w"], second: Float[Tensor, "h2 w2"]
+    ) -> tuple[Float[Tensor, "2 h w"], Float[Tensor, "2 h2 w2"]]:
+        scale = min(LARGEST_ENLARGEMENT, self.config.image_size / max(*first.shape, *second.shape))
+        working = [_resized(picture[None], scale)[0] for picture in (first, second)]
+        size = tuple(
+            max(LEAST_SIDE, *sides) for sides in zip(*(x.shape for x in working), strict=True)
+        )
+        a, b = (_bytes(_padded(picture, size)) for picture in working)
+        return (
+            _restored(_inverse_search(a, b), working[0].shape, first.shape),
+            _restored(_inverse_search(b, a), working[1].shape, second.shape),
+        )
+
+
+def grey(image: Float[Tensor, "3 h w"]) -> Float[Tensor, "h w"]:
+    """Brightness in [0, 1]."""
+    return torch.einsum("chw,c->hw", image, image.new_tensor(LUMA))
+
+
+def _inverse_search(
+    first: UInt8[np.ndarray, "h w"], second: UInt8[np.ndarray, "h w"]
+) -> Float[Tensor, "2 h w"]:
+    search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    search.setFinestScale(0)
+    start = np.zeros((*first.shape, 2), np.float32)
+    return torch.from_numpy(search.calc(first, second, start)).permute(2, 0, 1)
+
+
+def _resized(planes: Float[Tensor, "c h w"], scale: float) -> Float[Tensor, "c h2 w2"]:
+    size = [max(1, round(side * scale)) for side in planes.shape[-2:]]
+    return functional.interpolate(
+        planes[None], size, mode="bicubic", antialias=scale < 1, align_corners=False
+    )[0]
+
+
+def _padded(picture: Float[Tensor, "h w"], size: tuple[int, ...]) -> Float[Tensor, "h2 w2"]:
+    below, right = size[0] - picture.shape[0], size[1] - picture.shape[1]
+    return functional.pad(picture[None, None], (0, right, 0, below), mode="replicate")[0, 0]
+
+
+def _bytes(picture: Float[Tensor, "h w"]) -> UInt8[np.ndarray, "h w"]:
+    return picture.mul(255).round().clamp(0, 255).to(torch.uint8).numpy()
+
+
+def _restored(
+    flow: Float[Tensor, "2 h w"], working: torch.Size, size: torch.Size
+) -> Float[Tensor, "2 h2 w2"]:
+    """The flow of the working picture's part, in pixels of the picture of `size`."""
+    part = flow[:, : working[0], : working[1]]
+    resampled = functional.interpolate(
+        part[None], size, mode="bilinear", antialias=True, align_corners=False
+    )[0]
+    ratio = resampled.new_tensor([size[1] / working[1], size[0] / working[0]])
+    return resampled * ratio[:, None, None]
+
+
+def _sample(
+    planes: Float[Tensor, "c h2 w2"], flow: Float[Tensor, "2 h w"]
+) -> tuple[Float[Tensor, "c h w"], Bool[Tensor, "h w"]]:
+    """`planes` where the flow leads, and whether that lies inside them."""
+    size = flow.new_tensor([planes.shape[2], planes.shape[1]])
+    there = pixel_grid(*flow.shape[1:]) + flow.permute(1, 2, 0)
+    inside = ((there >= 0) & (there <= size)).all(-1)
+    sampled = functional.grid_sample(
+        planes[None],
+        (there / size * 2 - 1)[None],
+        padding_mode="border",
+        align_corners=False,
+    )
+    return sampled[0], inside
