@@ -2,7 +2,6 @@
 number an image.
 """
 
-import pickle
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,9 +9,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from skimage.metrics import structural_similarity
-from torch import Tensor, nn
+from torch import Tensor
 
 from extrap_train.errors import InputError
+from extrap_train.weight_files import WeightFile
 
 _SQUEEZENET = "squeezenet1_1-b8a52dc0.pth"
 
@@ -76,7 +76,12 @@ def squeeze_lpips(
         )
     network = lpips.LPIPS(net="squeeze", pnet_rand=weights is not None, verbose=False).eval()
     if weights is not None:
-        _load(network, Path(weights))
+        file = WeightFile(
+            Path(weights),
+            "validation.lpips_weights",
+            "the full state dict of lpips.LPIPS(net='squeeze')",
+        )
+        file.fill(network, file.tensors(file.read()))
     network.requires_grad_(False)
 
     @torch.no_grad()
@@ -87,15 +92,3 @@ def squeeze_lpips(
         return values.flatten()
 
     return distance
-
-
-def _load(network: nn.Module, path: Path) -> None:
-    if not path.is_file():
-        raise InputError(f"LPIPS weights not found: {path} (option validation.lpips_weights)")
-    try:
-        network.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
-    except (RuntimeError, OSError, EOFError, ValueError, TypeError, pickle.UnpicklingError):
-        raise InputError(
-            f"{path}: is no full state dict of lpips.LPIPS(net='squeeze'), plain tensors only "
-            "(option validation.lpips_weights)"
-        ) from None

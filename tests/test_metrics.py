@@ -73,5 +73,5 @@ def test_missing_lpips_weights_are_named(tmp_path: Path, monkeypatch: pytest.Mon
     with pytest.raises(InputError, match=r"bad\.pt"):
         squeeze_lpips(str(tmp_path / "bad.pt"))
     torch.save({"net.slice1.0.weight": torch.zeros(1)}, tmp_path / "other.pt")
-    with pytest.raises(InputError, match=r"other\.pt: is no full state dict"):
+    with pytest.raises(InputError, match=r"other\.pt: is another network"):
         squeeze_lpips(str(tmp_path / "other.pt"))

@@ -1,0 +1,124 @@
+import argparse
+import os
+import re
+from collections import OrderedDict
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+from torch import nn
+
+from extrap_train.errors import InputError
+from extrap_train.weight_files import Inert, WeightFile
+
+
+def weight_file(path: Path) -> WeightFile:
+    return WeightFile(path, "depth.checkpoint", "Net's weights (https://example.org/net)")
+
+
+def network() -> nn.Module:
+    return nn.Sequential(nn.Linear(3, 2), nn.LayerNorm(2))
+
+
+class Bomb:
+    """Runs a command when it is unpickled."""
+
+    def __init__(self, target: Path) -> None:
+        self.target = target
+
+    def __reduce__(self):
+        return os.system, (f"touch {self.target}",)
+
+
+@pytest.mark.parametrize("suffix", ["pth", "safetensors"])
+def test_what_was_written_is_read_and_fills_the_network(tmp_path, suffix):
+    expected, found = network(), network()
+    path = tmp_path / f"net.{suffix}"
+    (save_file if suffix == "safetensors" else torch.save)(expected.state_dict(), path)
+    file = weight_file(path)
+    file.fill(found, file.tensors(file.read()))
+    for name, value in expected.state_dict().items():
+        assert torch.equal(found.state_dict()[name], value)
+
+
+def test_a_network_on_meta_takes_half_precision_weights_as_its_own(tmp_path):
+    with torch.device("meta"):
+        found = network()
+    torch.save(network().half().state_dict(), tmp_path / "net.pth")
+    file = weight_file(tmp_path / "net.pth")
+    file.fill(found, file.tensors(file.read()))
+    assert {x.dtype for x in found.parameters()} == {torch.float32}
+    assert found(torch.zeros(1, 3)).isfinite().all()
+
+
+def test_a_wrapped_state_with_foreign_values_is_read_without_them(tmp_path):
+    state = OrderedDict(network().state_dict())
+    arguments = argparse.Namespace(model="__import__('os').abort()", epochs=3)
+    torch.save({"args": arguments, "model": state}, tmp_path / "net.pth")
+    file = weight_file(tmp_path / "net.pth")
+    content = file.read(inert=["argparse.Namespace"])
+    assert type(content["args"]) is Inert
+    assert content["args"].epochs == 3
+    assert file.tensors(content, "state_dict", "model").keys() == state.keys()
+
+
+def refused(file: WeightFile, said: str) -> None:
+    """One line that names the file, the option and the source beside what is wrong."""
+    with pytest.raises(InputError, match=re.escape(said)) as raised:
+        file.fill(network(), file.tensors(file.read(), "model"))
+    message = str(raised.value)
+    assert "\n" not in message
+    for part in (str(file.path), "depth.checkpoint=FILE", "https://example.org/net"):
+        assert part in message
+
+
+def test_absent(tmp_path):
+    refused(weight_file(tmp_path / "no.pth"), "there is no such file")
+
+
+@pytest.mark.parametrize("kept", [0, 1, 30, 500, 1200])
+@pytest.mark.parametrize("suffix", ["pth", "safetensors"])
+def test_truncated(tmp_path, kept, suffix):
+    path = tmp_path / f"net.{suffix}"
+    (save_file if suffix == "safetensors" else torch.save)(network().state_dict(), path)
+    path.write_bytes(path.read_bytes()[: min(kept, path.stat().st_size - 1)])
+    refused(weight_file(path), "is cut off, damaged, or no file of weights")
+
+
+def test_a_picture_is_no_weights(tmp_path):
+    (tmp_path / "net.pth").write_bytes(b"\x89PNG\r\n" + bytes(300))
+    refused(weight_file(tmp_path / "net.pth"), "is cut off, damaged, or no file of weights")
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_code_does_not_run(tmp_path, zipped):
+    content = {"model": network().state_dict(), "args": Bomb(tmp_path / "ran")}
+    path = tmp_path / "net.pth"
+    torch.save(content, path, _use_new_zipfile_serialization=zipped)
+    refused(weight_file(path), "could run code")
+    assert not (tmp_path / "ran").exists()
+
+
+def test_no_table_of_tensors(tmp_path):
+    torch.save({"model": [torch.zeros(1)]}, tmp_path / "net.pth")
+    refused(weight_file(tmp_path / "net.pth"), "holds no table of named tensors")
+
+
+@pytest.mark.parametrize(
+    ("other", "said"),
+    [
+        (nn.Sequential(nn.Linear(3, 2)), "of 4 tensors 2 missing (1.bias)"),
+        (
+            nn.Sequential(nn.Linear(4, 2), nn.LayerNorm(2)),
+            "of 4 tensors 1 of another shape (0.weight: [2, 4], not [2, 3])",
+        ),
+        (
+            nn.Sequential(nn.Linear(3, 2), nn.LayerNorm(2), nn.Linear(1, 1)),
+            "of 4 tensors 2 unknown (2.bias)",
+        ),
+    ],
+)
+def test_another_network(tmp_path, other, said):
+    torch.save({"model": other.state_dict()}, tmp_path / "net.pth")
+    refused(weight_file(tmp_path / "net.pth"), said)
