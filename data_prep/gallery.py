@@ -9,9 +9,8 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from data_prep.synthesize import walk_seed
 from extrap_train.config import CATEGORIES, SyntheticConfig
-from extrap_train.data.synthetic import build_scene, handheld_orbit, render
+from extrap_train.data.synthetic import build_scene, handheld_orbit, render, walk_seed
 
 
 def gallery(sequences: int, views: int, image_size: int) -> Float[Tensor, "3 h w"]:

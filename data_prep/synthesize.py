@@ -5,7 +5,6 @@ import multiprocessing
 import os
 import shutil
 import threading
-import zlib
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing.connection import wait
@@ -19,7 +18,14 @@ from extrap_train.config import SyntheticConfig
 from extrap_train.data.co3d import FRAME_ANNOTATIONS
 from extrap_train.data.co3d_writer import write_annotations, write_frame, write_sequence
 from extrap_train.data.files import write_whole
-from extrap_train.data.synthetic import build_scene, handheld_orbit, render, surface_points
+from extrap_train.data.synthetic import (
+    build_scene,
+    handheld_orbit,
+    render,
+    sequence_name,
+    surface_points,
+    walk_seed,
+)
 
 LOOK = 2
 """Raised whenever the same options give other pictures, so that old ones are not mixed with new."""
@@ -40,16 +46,6 @@ class _Job:
     def name(self) -> str:
         """The sequence's folder."""
         return sequence_name(self.index)
-
-
-def sequence_name(index: int) -> str:
-    """The folder's name of a sequence."""
-    return f"{index:04d}"
-
-
-def walk_seed(category: str, index: int, seed: int) -> int:
-    """The seed of the walk around a sequence's scene."""
-    return zlib.crc32(f"{seed}/{category}/{index}".encode())
 
 
 def synthesize(config: SyntheticConfig, category: str, root: Path, workers: int) -> None:

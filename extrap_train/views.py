@@ -68,6 +68,12 @@ class Camera:
         rows = self.intrinsics.new_tensor([width / self.width, height / self.height, 1.0])
         return replace(self, intrinsics=self.intrinsics * rows[:, None], height=height, width=width)
 
+    def squared(self, size: int) -> "Camera":
+        """The camera of the image's largest centred square, resampled to `size` × `size`."""
+        side = min(self.height, self.width)
+        top, left = (self.height - side) // 2, (self.width - side) // 2
+        return self.cropped(top, left, side, side).resized(size, size)
+
     def to(self, device: torch.device | str) -> "Camera":
         """The same camera on another device."""
         return combine([self], lambda tensors: tensors[0].to(device))

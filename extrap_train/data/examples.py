@@ -1,5 +1,6 @@
 """One training example: a query frame and its references, read from prepared data."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -45,6 +46,23 @@ def _mirrored_camera(camera: Camera) -> Camera:
     )
 
 
+def collate(examples: Sequence[Example], references: int) -> PairBatch:
+    """A batch with room for `references`; missing ones are the first again, marked invalid."""
+    orders = [
+        [i if i < len(e.reference_images) else 0 for i in range(references)] for e in examples
+    ]
+    valid = [[i < len(e.reference_images) for i in range(references)] for e in examples]
+    pairs = list(zip(examples, orders, strict=True))
+    return PairBatch(
+        image=torch.stack([e.image for e in examples]),
+        camera=stack_cameras([e.camera for e in examples]),
+        reference_images=torch.stack([e.reference_images[o] for e, o in pairs]),
+        reference_cameras=stack_cameras([e.reference_cameras[torch.tensor(o)] for e, o in pairs]),
+        reference_depths=torch.stack([e.reference_depths[o] for e, o in pairs]),
+        reference_valid=torch.tensor(valid),
+    )
+
+
 class ExampleReader:
     """Examples of one split of one or several prepared categories."""
 
@@ -80,23 +98,8 @@ class ExampleReader:
         return Example(images[0], cameras[0], images[1:], cameras[1:], depths[1:])
 
     def collate(self, examples: list[Example]) -> PairBatch:
-        """A batch with room for `references`; missing ones are the first again, marked invalid."""
-        orders = [
-            [i if i < len(e.reference_images) else 0 for i in range(self.references)]
-            for e in examples
-        ]
-        valid = [[i < len(e.reference_images) for i in range(self.references)] for e in examples]
-        pairs = list(zip(examples, orders, strict=True))
-        return PairBatch(
-            image=torch.stack([e.image for e in examples]),
-            camera=stack_cameras([e.camera for e in examples]),
-            reference_images=torch.stack([e.reference_images[o] for e, o in pairs]),
-            reference_cameras=stack_cameras(
-                [e.reference_cameras[torch.tensor(o)] for e, o in pairs]
-            ),
-            reference_depths=torch.stack([e.reference_depths[o] for e, o in pairs]),
-            reference_valid=torch.tensor(valid),
-        )
+        """A batch with room for the reader's number of references."""
+        return collate(examples, self.references)
 
     def _angles_of(self, data: PreparedData, sequence: str) -> np.ndarray:
         key = (data.folder, sequence)  # no `id`: it means nothing in a worker process

@@ -2,21 +2,30 @@
 
 from pathlib import Path
 
+from extrap_train.config import SyntheticConfig
 from extrap_train.data.co3d import read_sequence
 from extrap_train.data.colmap_model import find_model, read_model
 from extrap_train.data.posed import TRANSFORMS, read_transforms
 from extrap_train.data.sequences import Sequence
+from extrap_train.data.synthetic.capture import synthetic_sequence
 from extrap_train.errors import InputError
 
 CO3D_SCHEME = "co3d:"
+SYNTHETIC_SCHEME = "synthetic:"
 KNOWN_FORMS = (
-    "co3d:ROOT/category/sequence, a folder with a transforms.json, or a folder with a COLMAP model "
-    "(sparse/0 beside images)"
+    "co3d:ROOT/category/sequence, a folder with a transforms.json, a folder with a COLMAP model "
+    "(sparse/0 beside images), or synthetic:category/0003"
 )
 
 
-def open_scene(spec: str) -> Sequence:
-    """The capture that `spec` names; raises InputError that lists the known forms otherwise."""
+def open_scene(spec: str, synthetic: SyntheticConfig | None = None) -> Sequence:
+    """The capture that `spec` names; raises InputError that lists the known forms otherwise.
+
+    `synthetic` says how many frames, of what size and from which seed a synthetic capture has; its
+    defaults are those of `data=synthetic`.
+    """
+    if spec.startswith(SYNTHETIC_SCHEME):
+        return _open_synthetic(spec, synthetic or SyntheticConfig())
     if spec.startswith(CO3D_SCHEME):
         return _open_co3d(spec)
     folder = Path(spec).expanduser()
@@ -35,6 +44,13 @@ def _open_co3d(spec: str) -> Sequence:
     if len(path.parts) < 3:
         raise InputError(f"scene {spec!r}: is not co3d:ROOT/category/sequence; give all three")
     return read_sequence(path.parent.parent, path.parent.name, path.name)
+
+
+def _open_synthetic(spec: str, options: SyntheticConfig) -> Sequence:
+    category, _, number = spec.removeprefix(SYNTHETIC_SCHEME).partition("/")
+    if not (number.isascii() and number.isdigit()):
+        raise InputError(f"scene {spec!r}: is not synthetic:category/NUMBER, as hydrant/0003")
+    return synthetic_sequence(category, int(number), options)
 
 
 def _images_folder(folder: Path, model: Path) -> Path:

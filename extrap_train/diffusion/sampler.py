@@ -42,8 +42,11 @@ class ViewDenoiser(Protocol):
 
 
 def view_generator(seed: int, name: str) -> torch.Generator:
-    """The generator of one view: the same noise, whatever batch the view is sampled in."""
-    return torch.Generator().manual_seed(seed * 2**32 + zlib.crc32(name.encode()))
+    """The generator of one view: the same noise, whatever batch the view is sampled in.
+
+    Both are hashed into 32 bits: torch's CPU generator takes no more of a seed.
+    """
+    return torch.Generator().manual_seed(zlib.crc32(f"{seed}/{name}".encode()))
 
 
 @torch.no_grad()

@@ -12,6 +12,8 @@ from jaxtyping import Bool, Float, Int
 
 from extrap_train.views import Camera
 
+_LOOKS_AT_RAD = np.deg2rad(60)
+"""Between an optical axis and a centre that the camera can be said to look at."""
 _SAME_PLACE = 1e-9
 """Distances below this share of the scene's extent are zero."""
 
@@ -97,6 +99,22 @@ def nearest_references(
 ) -> Int[np.ndarray, "k"]:
     """Indices of the `count` views with the smallest angle, nearest first, ties by index."""
     return np.argsort(angles_to_query_rad, kind="stable")[:count]
+
+
+def references_by_nearness(references: Camera, queries: Camera) -> Int[np.ndarray, "q n"]:
+    """Indices of all references for each query, nearest first, ties by index.
+
+    Nearness is the angle between viewing directions at the point that the references look at;
+    where they have none in common (one camera, parallel axes), the distance between positions.
+    """
+    center = scene_center(references)
+    if len(references.world_to_cam) > 1 and facing(references, center, _LOOKS_AT_RAD).all():
+        cosines = directions_from(queries, center) @ directions_from(references, center).T
+        farness = np.arccos(np.clip(cosines, -1.0, 1.0))
+    else:
+        offsets = camera_centers(queries)[:, None] - camera_centers(references)
+        farness = np.linalg.norm(offsets, axis=-1)
+    return np.argsort(farness, axis=1, kind="stable")
 
 
 def extra_references(

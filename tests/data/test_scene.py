@@ -31,7 +31,7 @@ def test_a_colmap_model(tmp_path, place):
 @pytest.mark.parametrize(
     ("spec", "expected"),
     [
-        ("synthetic:hydrant/0003", "no such folder; give co3d:ROOT/category/sequence"),
+        ("synthetc:hydrant/0003", "no such folder; give co3d:ROOT/category/sequence"),
         ("{folder}/gone", "no such folder"),
         ("{folder}", "holds neither kind of camera file"),
         ("co3d:cup/one", "is not co3d:ROOT/category/sequence"),

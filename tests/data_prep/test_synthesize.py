@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from data_prep.gallery import gallery
-from data_prep.synthesize import synthesize, walk_seed
+from data_prep.synthesize import synthesize
 from extrap_train.config import SyntheticConfig
 from extrap_train.data.co3d import read_category
-from extrap_train.data.synthetic import build_scene, handheld_orbit, render
+from extrap_train.data.synthetic import build_scene, handheld_orbit, render, walk_seed
 from extrap_train.errors import InputError
 
 SMALL = SyntheticConfig(test_sequences=1, train_sequences=2, frames=3, image_size=16)

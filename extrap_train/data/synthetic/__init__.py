@@ -5,7 +5,7 @@
 """
 
 from extrap_train.data.synthetic.build import build_scene
-from extrap_train.data.synthetic.orbit import handheld_orbit
+from extrap_train.data.synthetic.orbit import handheld_orbit, sequence_name, walk_seed
 from extrap_train.data.synthetic.points import SurfacePoints, surface_points
 from extrap_train.data.synthetic.render import render
 from extrap_train.data.synthetic.scene import SyntheticScene
@@ -16,5 +16,7 @@ __all__ = [
     "build_scene",
     "handheld_orbit",
     "render",
+    "sequence_name",
     "surface_points",
+    "walk_seed",
 ]

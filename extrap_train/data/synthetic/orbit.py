@@ -1,11 +1,23 @@
 """Hand-held walks around an object."""
 
+import zlib
+
 import numpy as np
 import torch
 from jaxtyping import Float
 
 from extrap_train.data.synthetic.scene import SyntheticScene
 from extrap_train.views import Camera
+
+
+def sequence_name(index: int) -> str:
+    """The name of a category's sequence with this number."""
+    return f"{index:04d}"
+
+
+def walk_seed(category: str, index: int, seed: int) -> int:
+    """The seed of the walk around a sequence's scene."""
+    return zlib.crc32(f"{seed}/{category}/{index}".encode())
 
 
 def handheld_orbit(scene: SyntheticScene, frames: int, image_size: int, seed: int) -> Camera:

@@ -1,0 +1,93 @@
+"""The view from a pose: posed views with depth in, pictures at the queries out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from extrap_train.config import SamplerConfig
+from extrap_train.data.module import with_warp
+from extrap_train.data.queries import query_batch
+from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.sampler import sample_views, view_generator
+from extrap_train.views import Camera, View, Warp, combine
+
+
+@dataclass(frozen=True)
+class GeneratedViews:
+    """Pictures at the queries, and what they were made from."""
+
+    images: Float[Tensor, "n 3 h w"]
+    """In [0, 1]."""
+    cameras: Camera
+    """The queries at the pictures' size: the largest centred square of what was asked for."""
+    warp: Warp
+    """What the references show of each query."""
+    references: list[tuple[int, ...]]
+    """Indices of the views that each query was warped from, nearest first."""
+
+
+@runtime_checkable
+class ViewGenerator(Protocol):
+    """Whatever can paint a scene's view from any pose; a test's oracle is one too."""
+
+    @property
+    def image_size(self) -> int:
+        """Side of the square pictures, in pixels."""
+        ...
+
+    def generate(
+        self, references: Sequence[View], queries: Camera, names: Sequence[str], seed: int = 0
+    ) -> GeneratedViews:
+        """Pictures of the queries (batched once), from views that have depth.
+
+        A query's noise follows from `seed` and its name alone: the picture depends neither on the
+        queries beside it nor on their number. Raises InputError for degenerate cameras and for
+        views without depth.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class DiffusionGenerator:
+    """Samples the views with a diffusion model, from up to its number of nearest references."""
+
+    model: ExtrapolationModel
+    sampler: SamplerConfig
+    batch_size: int = 16
+    """Queries that are denoised at a time."""
+
+    @property
+    def image_size(self) -> int:
+        """See `ViewGenerator.image_size`."""
+        return self.model.config.image_size
+
+    def generate(
+        self, references: Sequence[View], queries: Camera, names: Sequence[str], seed: int = 0
+    ) -> GeneratedViews:
+        """See `ViewGenerator.generate`."""
+        if len(names) != len(queries.world_to_cam):
+            raise ValueError(f"{len(names)} names for {len(queries.world_to_cam)} queries")
+        parts = [
+            self._generate(references, queries[at : at + self.batch_size], names[at:], seed)
+            for at in range(0, len(names), self.batch_size)
+        ]
+        whole = combine(parts, lambda tensors: torch.cat(list(tensors)))
+        chosen = [row for part in parts for row in part.references]
+        return GeneratedViews(whole.images, whole.cameras, whole.warp, chosen)
+
+    def _generate(
+        self, references: Sequence[View], queries: Camera, names: Sequence[str], seed: int
+    ) -> GeneratedViews:
+        config = self.model.config
+        batch, chosen = query_batch(references, queries, config.references, config.image_size)
+        device = next(self.model.parameters()).device
+        batch = with_warp(batch.to(device))
+        generators = [view_generator(seed, name) for name in names[: len(chosen)]]
+        images = sample_views(self.model, batch, self.sampler, generators)
+        assert batch.warp is not None
+        made = GeneratedViews(images, batch.camera, batch.warp, chosen)
+        return combine([made], lambda tensors: tensors[0].cpu())
