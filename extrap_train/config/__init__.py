@@ -16,15 +16,23 @@ from extrap_train.config.data import (
 )
 from extrap_train.config.depth import DatasetDepthConfig, DepthConfig, StereoConfig
 from extrap_train.config.matching import FlowMatcherConfig, MatcherConfig
-from extrap_train.config.model import NORM_GROUPS, ModelConfig, SamplerConfig, UNetConfig
+from extrap_train.config.model import (
+    FAMILIES,
+    ClipConfig,
+    ModelConfig,
+    SamplerConfig,
+    UNetConfig,
+    VaeConfig,
+)
 from extrap_train.config.training import TrainerConfig, ValidationConfig
 from extrap_train.config.tree import MISSING, dotted
 
 __all__ = [
     "CATEGORIES",
+    "FAMILIES",
     "MISSING",
-    "NORM_GROUPS",
     "CategoryConfig",
+    "ClipConfig",
     "Co3dConfig",
     "DataConfig",
     "DataPrepConfig",
@@ -40,6 +48,7 @@ __all__ = [
     "TrainConfig",
     "TrainerConfig",
     "UNetConfig",
+    "VaeConfig",
     "ValidationConfig",
     "dotted",
     "validate",

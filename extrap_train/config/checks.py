@@ -5,7 +5,7 @@ from dataclasses import asdict
 
 from extrap_train.config.commands import DataPrepConfig, TrainConfig
 from extrap_train.config.data import Co3dConfig, PrepConfig
-from extrap_train.config.model import NORM_GROUPS, ModelConfig
+from extrap_train.config.model import FAMILIES, ModelConfig
 from extrap_train.config.tree import dotted
 from extrap_train.errors import InputError
 
@@ -32,6 +32,12 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "model.unet.layers_per_block": (1, 16),
     "model.unet.heads": (1, 64),
     "model.unet.token_width": (1, 8192),
+    "model.unet.norm_groups": (1, 1024),
+    "model.vae.layers_per_block": (1, 16),
+    "model.clip.width": (1, 8192),
+    "model.clip.layers": (1, 64),
+    "model.clip.heads": (1, 64),
+    "model.clip.embedding_width": (1, 8192),
     "sampler.steps": (1, 1000),
     "sampler.eta": (0, 1),
     "trainer.steps": (1, math.inf),
@@ -60,6 +66,8 @@ def validate(config: TrainConfig | DataPrepConfig, tasks: tuple[str, ...]) -> No
         _check_one_of("task", config.task, tasks)
         _check_one_of("trainer.precision", config.trainer.precision, _PRECISIONS)
         _check_model(config.model, config.prep)
+        if config.sampler.compat is not None:
+            _check_one_of("sampler.compat", config.sampler.compat, ("megascenes",))
 
 
 def _check_bounds(config: TrainConfig | DataPrepConfig) -> None:
@@ -83,21 +91,27 @@ def _check_prep(prep: PrepConfig) -> None:
 
 def _check_model(model: ModelConfig, prep: PrepConfig) -> None:
     _check_one_of("model.prediction", model.prediction, ("epsilon", "v_prediction", "sample"))
+    _check_one_of("model.family", model.family, FAMILIES)
+    if model.residual and model.family != "ours":
+        raise InputError(
+            f"model.residual=true needs the fused warp, which model.family={model.family} is not "
+            "told: give model.residual=false"
+        )
     if model.image_size != prep.image_size:
         raise InputError(
             f"model.image_size={model.image_size} but "
             f"prep.image_size={prep.image_size}: give both the same"
         )
-    odd = [width for width in model.unet.channels if width <= 0 or width % NORM_GROUPS]
+    groups = model.unet.norm_groups
+    odd = [width for width in model.unet.channels if width <= 0 or width % groups]
     if odd or not model.unet.channels:
-        raise InputError(
-            f"model.unet.channels={model.unet.channels}: need multiples of {NORM_GROUPS}"
-        )
-    coarsest = model.patch * 2 ** (len(model.unet.channels) - 1)
+        raise InputError(f"model.unet.channels={model.unet.channels}: need multiples of {groups}")
+    factor = model.patch if model.vae is None else 2 ** (len(model.vae.channels) - 1)
+    coarsest = factor * 2 ** (len(model.unet.channels) - 1)
     if model.image_size % coarsest:
         raise InputError(
             f"model.image_size={model.image_size} is no multiple of {coarsest}, "
-            "which model.patch and the levels of model.unet.channels need"
+            "which the latents' factor and the levels of model.unet.channels need"
         )
     if len(model.unet.channels) != len(model.unet.attention_levels):
         raise InputError("model.unet.channels and model.unet.attention_levels differ in length")

@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 
 from extrap_train.config.tree import MISSING
 
-NORM_GROUPS = 16
-"""Groups of the denoiser's normalisations: the widths of its levels are multiples of it."""
+FAMILIES = ("zeronvs", "megascenes", "ours")
+"""What a denoiser may be told about the query view; `extrap_train.diffusion.family` has each."""
 
 
 @dataclass
@@ -18,6 +18,26 @@ class UNetConfig:
     heads: int = 4
     token_width: int = 192
     """Width of the one cross-attention token."""
+    norm_groups: int = 16
+    """Of the normalisations; the widths of the levels are multiples of it."""
+
+
+@dataclass
+class VaeConfig:
+    """Shape of the latent space's autoencoder (diffusers' `AutoencoderKL`); Stable Diffusion's."""
+
+    channels: list[int] = field(default_factory=lambda: [128, 256, 512, 512])
+    layers_per_block: int = 2
+
+
+@dataclass
+class ClipConfig:
+    """Shape of CLIP's image tower at 224² pixels in patches of 14²; ViT-L/14's."""
+
+    width: int = 1024
+    layers: int = 24
+    heads: int = 16
+    embedding_width: int = 768
 
 
 @dataclass
@@ -25,15 +45,23 @@ class ModelConfig:
     """A denoiser with its conditioning (METHOD: paper II-B)."""
 
     name: str = MISSING
+    family: str = "ours"
+    """What the denoiser is told: `zeronvs` pose only, `megascenes` pose and the nearest reference's
+    warp, `ours` the fused warp, its positional encoding and its mask, too.
+    """
     image_size: int = 64
+    vae: VaeConfig | None = None
+    """Autoencoder of the latents; null takes patches of pixels."""
     patch: int = 2
     """Pixels a side that become channels of one latent: the small model's stand-in for a VAE."""
+    clip: ClipConfig | None = None
+    """Encoder of the reference image; null takes a small one that is trained along."""
     references: int = 3
     """Most references that a view is warped from (paper III-A.4)."""
     octaves: int = 4
     """Of the positional encoding: 4 channels each."""
     residual: bool = True
-    """Denoise the difference to the hole-filled warp instead of the image itself."""
+    """Denoise the difference to the hole-filled warp instead of the image itself; `ours` only."""
     prediction: str = "sample"
     """`epsilon`, `v_prediction` or `sample`."""
     zero_terminal_snr: bool = True
@@ -52,3 +80,7 @@ class SamplerConfig:
     eta: float = 0.0
     guidance: float = 1.0
     """Weight of the conditional prediction against the null condition's; 1 is no guidance."""
+    compat: str | None = None
+    """`megascenes` samples as ZeroNVS and MegaScenes were published: guidance against plain zeros,
+    which their training never saw, and the noisiest step left out.
+    """

@@ -1,11 +1,11 @@
 """What the denoiser is told about the query view (METHOD section 3; paper II-B).
 
-Input channels, in order: `noisy latent | reference latent | warped-image latent | PE(reference) |
-PE(warped) | mask`, all at the latents' resolution, and one cross-attention token from the
-reference's embedding and the relative pose.
+Input channels of `model.family=ours`, in order: `noisy latent | reference latent | warped-image
+latent | PE(reference) | PE(warped) | mask`, all at the latents' resolution, and one cross-attention
+token from the reference's embedding and the relative pose. `family` has the other families.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -16,6 +16,14 @@ from extrap_train.diffusion.autoencoder import Autoencoder
 from extrap_train.geometry.encoding import coordinate_grid, positional_encoding
 from extrap_train.geometry.fill import fill_holes
 from extrap_train.views import PairBatch, Warp, combine
+
+
+@dataclass(frozen=True)
+class Null:
+    """What the null condition sets to zero: the first channels, None for all of them."""
+
+    latents: int | None = None
+    embedding: int | None = None
 
 
 @dataclass(frozen=True)
@@ -30,20 +38,37 @@ class Conditioning:
     """Latent that the denoised latent is added to: the filled warp, or zero. No part of the
     condition.
     """
+    token_weight: Float[Tensor, " b"]
+    """1; 0 where the token is plain zeros instead of a projected embedding."""
+    null: Null = Null()
 
     def zeroed(self, where: Bool[Tensor, " b"]) -> "Conditioning":
         """The null condition, the same in training and in sampling, for the chosen examples."""
-        keep = (~where).to(self.latents.dtype)
-        return Conditioning(
-            self.latents * keep[:, None, None, None], self.embedding * keep[:, None], self.base
+        return replace(
+            self,
+            latents=_zeroed(self.latents, where, self.null.latents),
+            embedding=_zeroed(self.embedding, where, self.null.embedding),
         )
 
-    def doubled(self) -> "Conditioning":
-        """Condition and null condition stacked along the batch, for guidance in one pass."""
-        null = self.zeroed(
-            torch.ones(len(self.latents), dtype=torch.bool, device=self.latents.device)
-        )
+    def doubled(self, *, plain_zeros: bool = False) -> "Conditioning":
+        """Condition and null condition stacked along the batch, for guidance in one pass.
+
+        `plain_zeros` is the null condition that ZeroNVS and MegaScenes sample with and never
+        trained on: every channel is zero, and the token, too, which is not projected.
+        """
+        null = self.zeroed(torch.ones_like(self.token_weight, dtype=torch.bool))
+        if plain_zeros:
+            zeros = torch.zeros_like(self.latents), torch.zeros_like(self.token_weight)
+            null = replace(self, latents=zeros[0], token_weight=zeros[1])
         return combine([self, null], lambda tensors: torch.cat(list(tensors)))
+
+
+def _zeroed(
+    channels: Float[Tensor, "b c *hw"], where: Bool[Tensor, " b"], count: int | None
+) -> Float[Tensor, "b c *hw"]:
+    dropped = torch.zeros(channels.shape[:2], dtype=torch.bool, device=channels.device)
+    dropped[:, :count] = where[:, None]
+    return channels * (~dropped).to(channels.dtype)[(...,) + (None,) * (channels.ndim - 2)]
 
 
 def condition_channels(latent_channels: int, octaves: int) -> int:
@@ -62,7 +87,7 @@ def concatenated_latents(
     """The channels behind the noisy latent, and the filled warp's latent among them."""
     if batch.warp is None:
         raise ValueError("the batch has no warp yet: call `with_warp` first")
-    reference = autoencoder.encode(batch.reference_images[:, 0])
+    reference = autoencoder.encode_reference(batch.reference_images[:, 0])
     warped = autoencoder.encode(filled_warp(batch.warp))
     height, width = reference.shape[-2:]
     grid = coordinate_grid(height, width).to(reference).expand(len(reference), -1, -1, -1)

@@ -2,7 +2,7 @@
 
 from diffusers import UNet2DConditionModel
 
-from extrap_train.config import NORM_GROUPS, UNetConfig
+from extrap_train.config import UNetConfig
 
 
 def build_unet(
@@ -21,7 +21,7 @@ def build_unet(
         up_block_types=tuple(up),
         cross_attention_dim=config.token_width,
         attention_head_dim=config.heads,  # diffusers' historical name for the number of heads
-        norm_num_groups=NORM_GROUPS,
+        norm_num_groups=config.norm_groups,
     )
     unet.conv_out.weight.data.zero_()
     unet.conv_out.bias.data.zero_()

@@ -7,48 +7,47 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from extrap_train.config import ModelConfig
-from extrap_train.diffusion.autoencoder import PixelPatches
-from extrap_train.diffusion.conditioning import (
-    Conditioning,
-    concatenated_latents,
-    condition_channels,
-)
+from extrap_train.diffusion.autoencoder import build_autoencoder
+from extrap_train.diffusion.conditioning import Conditioning
 from extrap_train.diffusion.denoiser import build_unet
-from extrap_train.diffusion.image_encoder import SmallImageEncoder
-from extrap_train.diffusion.pose_encoding import POSE_CHANNELS, depth_scale, zeronvs_pose
+from extrap_train.diffusion.family import FAMILIES
+from extrap_train.diffusion.image_encoder import build_image_encoder
+from extrap_train.diffusion.pose_encoding import POSE_CHANNELS
 from extrap_train.diffusion.schedule import noise_schedule
 from extrap_train.views import PairBatch
 
-_EMBEDDING_WIDTH = 128
-
 
 class ExtrapolationModel(nn.Module):
-    """Denoiser, image encoder, projection to the token, and the latent space they work in."""
+    """Denoiser, image encoder, projection to the token, and the latent space they work in.
+
+    Small or full size, of any family: the configuration chooses the parts, and nothing else
+    differs. A VAE and CLIP are frozen and no modules of it (`frozen.Frozen`).
+    """
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
         self.config = config
-        self.autoencoder = PixelPatches(config.patch)
+        self.family = FAMILIES[config.family]
+        self.autoencoder = build_autoencoder(config)
         latent_channels = self.autoencoder.channels
         self.unet = build_unet(
             config.unet,
-            latent_channels + condition_channels(latent_channels, config.octaves),
+            latent_channels + self.family.channels(latent_channels, config),
             latent_channels,
             config.image_size // self.autoencoder.factor,
         )
-        self.image_encoder = SmallImageEncoder(_EMBEDDING_WIDTH)
-        self.cc_projection = nn.Linear(_EMBEDDING_WIDTH + POSE_CHANNELS, config.unet.token_width)
+        self.image_encoder = build_image_encoder(config)
+        width = self.image_encoder.width
+        self.cc_projection = nn.Linear(width + POSE_CHANNELS, config.unet.token_width)
+        self.null = self.family.null(latent_channels, width)
         self.schedule = noise_schedule(config)
 
     def condition(self, batch: PairBatch) -> Conditioning:
         """The batch's condition; the batch must hold its warp."""
-        latents, warped = concatenated_latents(batch, self.autoencoder, self.config.octaves)
-        pose = zeronvs_pose(
-            batch.reference_cameras[:, 0], batch.camera, depth_scale(batch.reference_depths[:, 0])
-        )
-        embedding = torch.cat([self.image_encoder(batch.reference_images[:, 0]), pose], -1)
-        base = warped if self.config.residual else torch.zeros_like(warped)
-        return Conditioning(latents, embedding, base)
+        latents, base = self.family.latents(batch, self.autoencoder, self.config)
+        image = self.image_encoder(batch.reference_images[:, 0])
+        embedding = torch.cat([image, self.family.pose(batch)], -1)
+        return Conditioning(latents, embedding, base, torch.ones_like(embedding[:, 0]), self.null)
 
     def forward(
         self,
@@ -57,15 +56,22 @@ class ExtrapolationModel(nn.Module):
         conditioning: Conditioning,
     ) -> Float[Tensor, "b z h w"]:
         """The prediction (ε, v or sample, as configured) for noisy latents relative to the base."""
-        token = self.cc_projection(conditioning.embedding)[:, None]
+        token = self.cc_projection(conditioning.embedding)
+        token = token * conditioning.token_weight[:, None].to(token.dtype)
         channels = torch.cat([noisy, conditioning.latents], 1)
-        return self.unet(channels, timestep, token).sample.float()
+        return self.unet(channels, timestep, token[:, None]).sample.float()
 
     def encode_target(
-        self, image: Float[Tensor, "b 3 h w"], conditioning: Conditioning
+        self,
+        image: Float[Tensor, "b 3 h w"],
+        conditioning: Conditioning,
+        generator: torch.Generator | None = None,
     ) -> Float[Tensor, "b z h2 w2"]:
-        """What is denoised: the image's latent, relative to the condition's base."""
-        return self.autoencoder.encode(image) - conditioning.base
+        """What is denoised: the image's latent, relative to the condition's base.
+
+        With a generator the latent is drawn from the autoencoder's posterior, where it has one.
+        """
+        return self.autoencoder.encode(image, generator) - conditioning.base
 
     def decode_target(
         self, latent: Float[Tensor, "b z h2 w2"], conditioning: Conditioning

@@ -1,4 +1,15 @@
-"""The relative pose as 19 numbers, in ZeroNVS's convention (`7dof_quantile_scale`)."""
+"""The relative pose as 19 numbers, in the two published conventions.
+
+| | `zeronvs_pose` (`7dof_quantile_scale`) | `megascenes_pose` |
+|---|---|---|
+| camera axes | OpenGL | OpenCV |
+| translation | squashed to 5·tanh(t / 10), about half of it | as it is |
+| field of view | smaller of the query's two | along the query's diagonal |
+
+Weights trained with one read the other as a turned and halved motion through another lens.
+"""
+
+import math
 
 import torch
 from jaxtyping import Float
@@ -9,18 +20,17 @@ from extrap_train.views import Camera
 
 POSE_CHANNELS = 19
 _NEAREST_QUANTILE = 0.2
-_LEAST_SCALE = 1e-2
 
 
-def depth_scale(depth: Float[Tensor, "b h w"]) -> Float[Tensor, " b"]:
-    """Scene scale of a reference: the 0.2 quantile of its known depth on every fourth pixel; 1 if
-    none.
+def depth_scale(depth: Float[Tensor, "b h w"], every: int, least: float) -> Float[Tensor, " b"]:
+    """Scene scale of a reference: the 0.2 quantile of its known depth on every `every`-th pixel, at
+    `least` so much; 1 if none is known.
     """
     scales = []
-    for sparse in depth[:, ::4, ::4]:
+    for sparse in depth[:, ::every, ::every]:
         known = sparse[sparse > 0]
         scales.append(known.quantile(_NEAREST_QUANTILE) if known.numel() else sparse.new_ones(()))
-    return torch.stack(scales).clamp_min(_LEAST_SCALE)
+    return torch.stack(scales).clamp_min(least)
 
 
 def zeronvs_pose(
@@ -48,5 +58,27 @@ def _zeronvs_pose(
         2 * torch.atan(query.width / (2 * query.intrinsics[:, 0, 0])),
         2 * torch.atan(query.height / (2 * query.intrinsics[:, 1, 1])),
     )
+    return _nineteen(relative, fov_rad)
+
+
+def megascenes_pose(
+    reference: Camera, query: Camera, scale: Float[Tensor, " b"]
+) -> Float[Tensor, "b 19"]:
+    """Relative pose and field of view: 16 matrix entries row by row, then fov, sin fov, cos fov.
+
+    The matrix is inv(cam_to_world of the reference) @ cam_to_world of the query in OpenCV axes; its
+    translation is in units of the scene scale. The field of view is the query's along its diagonal
+    at the horizontal focal length, in radians. Full precision, as `zeronvs_pose`.
+    """
+    with torch.autocast(reference.world_to_cam.device.type, enabled=False):
+        relative = reference.world_to_cam @ query.cam_to_world
+        relative[:, :3, 3] /= scale[:, None]
+        diagonal = math.hypot(query.width, query.height)
+        return _nineteen(relative, 2 * torch.atan(diagonal / (2 * query.intrinsics[:, 0, 0])))
+
+
+def _nineteen(
+    relative: Float[Tensor, "b 4 4"], fov_rad: Float[Tensor, " b"]
+) -> Float[Tensor, "b 19"]:
     fov = torch.stack([fov_rad, fov_rad.sin(), fov_rad.cos()], -1)
     return torch.cat([relative.flatten(1), fov], -1)

@@ -63,9 +63,11 @@ def sample_views(
     conditioning = model.condition(batch)
     schedule = copy.deepcopy(model.schedule)
     schedule.set_timesteps(config.steps)
+    published = config.compat == "megascenes"
     latent = _noise(conditioning.base, generators)
-    for timestep in schedule.timesteps:
-        prediction = _guided(model, latent, int(timestep), conditioning, config.guidance)
+    for timestep in schedule.timesteps[1:] if published else schedule.timesteps:
+        steps = torch.full((len(latent),), int(timestep), device=latent.device)
+        prediction = _guided(model, latent, steps, conditioning, config)
         noise = _noise(latent, generators) if config.eta > 0 else None
         latent = schedule.step(
             prediction, timestep, latent, eta=config.eta, variance_noise=noise
@@ -82,14 +84,13 @@ def _noise(
 def _guided(
     model: ViewDenoiser,
     latent: Float[Tensor, "b z h w"],
-    timestep: int,
+    timestep: Int[Tensor, " b"],
     conditioning: Conditioning,
-    guidance: float,
+    config: SamplerConfig,
 ) -> Float[Tensor, "b z h w"]:
-    if guidance == 1:
-        steps = torch.full((len(latent),), timestep, device=latent.device)
-        return model(latent, steps, conditioning)
-    steps = torch.full((2 * len(latent),), timestep, device=latent.device)
-    both = model(torch.cat([latent, latent]), steps, conditioning.doubled())
+    if config.guidance == 1:
+        return model(latent, timestep, conditioning)
+    doubled = conditioning.doubled(plain_zeros=config.compat == "megascenes")
+    both = model(torch.cat([latent, latent]), torch.cat([timestep, timestep]), doubled)
     conditional, null = both.chunk(2)
-    return null + guidance * (conditional - null)
+    return null + config.guidance * (conditional - null)

@@ -40,7 +40,7 @@ def diffusion_loss(
     alone.
     """
     conditioning = model.condition(batch)
-    target = model.encode_target(batch.image, conditioning)
+    target = model.encode_target(batch.image, conditioning, generator)
     count = len(target)
     dropped = torch.rand(count, generator=generator) < condition_dropout
     steps = model.schedule.config["num_train_timesteps"]

@@ -10,6 +10,7 @@ from extrap_train.data.module import with_warp
 from extrap_train.diffusion.autoencoder import PixelPatches
 from extrap_train.diffusion.conditioning import (
     Conditioning,
+    Null,
     concatenated_latents,
     condition_channels,
     filled_warp,
@@ -70,7 +71,9 @@ def test_a_warp_without_any_pixel_is_filled_with_grey(batch: PairBatch) -> None:
 
 
 def test_zeroed_examples_are_null_and_the_others_untouched() -> None:
-    one = Conditioning(torch.rand(2, 5, 4, 4), torch.rand(2, 7), torch.rand(2, 3, 4, 4))
+    one = Conditioning(
+        torch.rand(2, 5, 4, 4), torch.rand(2, 7), torch.rand(2, 3, 4, 4), torch.ones(2)
+    )
     some = one.zeroed(torch.tensor([True, False]))
     assert not some.latents[0].any()
     assert not some.embedding[0].any()
@@ -78,3 +81,24 @@ def test_zeroed_examples_are_null_and_the_others_untouched() -> None:
     assert torch.equal(some.base, one.base), "the base is added afterwards and is no condition"
     doubled = one.doubled()
     assert torch.equal(doubled.latents[2:], one.zeroed(torch.tensor([True, True])).latents)
+
+
+def test_a_null_takes_away_what_its_family_says_and_no_more() -> None:
+    one = Conditioning(
+        torch.rand(2, 7, 4, 4), torch.rand(2, 9), torch.rand(2, 3, 4, 4), torch.ones(2), Null(4, 6)
+    )
+    null = one.doubled()
+    assert not null.latents[2:, :4].any()
+    assert not null.embedding[2:, :6].any()
+    assert torch.equal(null.latents[2:, 4:], one.latents[:, 4:]), "the warp is kept"
+    assert torch.equal(null.embedding[2:, 6:], one.embedding[:, 6:]), "the pose is kept"
+    assert torch.equal(null.token_weight, torch.ones(4))
+
+
+def test_plain_zeros_silence_the_token_and_every_channel() -> None:
+    one = Conditioning(
+        torch.rand(2, 7, 4, 4), torch.rand(2, 9), torch.rand(2, 3, 4, 4), torch.ones(2), Null(4, 6)
+    )
+    null = one.doubled(plain_zeros=True)
+    assert not null.latents[2:].any()
+    assert null.token_weight.tolist() == [1, 1, 0, 0]

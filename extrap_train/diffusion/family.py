@@ -1,0 +1,139 @@
+"""The three families of denoisers: which channels each is told, which pose, and what its null
+condition takes away.
+
+| family | behind the noisy latent | pose | null condition |
+|---|---|---|---|
+| `zeronvs` | reference latent | ZeroNVS | no image embedding, no reference latent |
+| `megascenes` | reference latent, RGB of the nearest reference's warp | MegaScenes | the same |
+| `ours` | `conditioning.concatenated_latents` | ZeroNVS | everything |
+
+The published families keep pose and warp in the null condition, because their training never
+dropped these.
+"""
+
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from extrap_train.config import ModelConfig
+from extrap_train.diffusion.autoencoder import Autoencoder
+from extrap_train.diffusion.conditioning import Null, concatenated_latents, condition_channels
+from extrap_train.diffusion.pose_encoding import depth_scale, megascenes_pose, zeronvs_pose
+from extrap_train.geometry.resample import lanczos_resize
+from extrap_train.geometry.warp import warp_references
+from extrap_train.views import PairBatch
+
+
+@runtime_checkable
+class Family(Protocol):
+    """One family; the batch that it is given must hold its warp."""
+
+    def channels(self, latent_channels: int, config: ModelConfig) -> int:
+        """How many channels stand behind the noisy latent."""
+        ...
+
+    def latents(
+        self, batch: PairBatch, autoencoder: Autoencoder, config: ModelConfig
+    ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b z h w"]]:
+        """These channels, and the latent that the denoised one is relative to."""
+        ...
+
+    def pose(self, batch: PairBatch) -> Float[Tensor, "b 19"]:
+        """The query's pose relative to the nearest reference."""
+        ...
+
+    def null(self, latent_channels: int, embedding_width: int) -> Null:
+        """What the null condition takes away of latents and embedding."""
+        ...
+
+
+class ZeroNvs:
+    """Pose only (Sargent et al. 2024): the network has to imagine the query from the reference."""
+
+    def channels(self, latent_channels: int, config: ModelConfig) -> int:
+        """See `Family.channels`."""
+        return latent_channels
+
+    def latents(
+        self, batch: PairBatch, autoencoder: Autoencoder, config: ModelConfig
+    ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b z h w"]]:
+        """See `Family.latents`."""
+        reference = autoencoder.encode_reference(batch.reference_images[:, 0])
+        return reference, torch.zeros_like(reference)
+
+    def pose(self, batch: PairBatch) -> Float[Tensor, "b 19"]:
+        """See `Family.pose`."""
+        return _zeronvs_pose(batch)
+
+    def null(self, latent_channels: int, embedding_width: int) -> Null:
+        """See `Family.null`."""
+        return Null(latent_channels, embedding_width)
+
+
+class MegaScenes:
+    """Pose and the nearest reference's warp (Tung et al. 2024), black in its holes."""
+
+    def channels(self, latent_channels: int, config: ModelConfig) -> int:
+        """See `Family.channels`."""
+        return latent_channels + 3
+
+    def latents(
+        self, batch: PairBatch, autoencoder: Autoencoder, config: ModelConfig
+    ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b z h w"]]:
+        """See `Family.latents`; the warp is not encoded but shrunk to the latents' size."""
+        reference = autoencoder.encode_reference(batch.reference_images[:, 0])
+        height, width = reference.shape[-2:]
+        warp = warp_references(
+            batch.reference_images[:, :1],
+            batch.reference_depths[:, :1],
+            batch.reference_cameras[:, :1],
+            batch.reference_valid[:, :1],
+            batch.camera,
+        )
+        shrunk = lanczos_resize(warp.image, height, width).clamp(0, 1) * 2 - 1
+        return torch.cat([reference, shrunk], 1), torch.zeros_like(reference)
+
+    def pose(self, batch: PairBatch) -> Float[Tensor, "b 19"]:
+        """See `Family.pose`."""
+        return megascenes_pose(
+            batch.reference_cameras[:, 0],
+            batch.camera,
+            depth_scale(batch.reference_depths[:, 0], every=1, least=1e-7),
+        )
+
+    def null(self, latent_channels: int, embedding_width: int) -> Null:
+        """See `Family.null`."""
+        return Null(latent_channels, embedding_width)
+
+
+class Ours:
+    """The fused warp of several references with its positional encoding (METHOD section 3)."""
+
+    def channels(self, latent_channels: int, config: ModelConfig) -> int:
+        """See `Family.channels`."""
+        return condition_channels(latent_channels, config.octaves)
+
+    def latents(
+        self, batch: PairBatch, autoencoder: Autoencoder, config: ModelConfig
+    ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b z h w"]]:
+        """See `Family.latents`."""
+        latents, warped = concatenated_latents(batch, autoencoder, config.octaves)
+        return latents, warped if config.residual else torch.zeros_like(warped)
+
+    def pose(self, batch: PairBatch) -> Float[Tensor, "b 19"]:
+        """See `Family.pose`."""
+        return _zeronvs_pose(batch)
+
+    def null(self, latent_channels: int, embedding_width: int) -> Null:
+        """See `Family.null`."""
+        return Null()
+
+
+FAMILIES: dict[str, Family] = {"zeronvs": ZeroNvs(), "megascenes": MegaScenes(), "ours": Ours()}
+
+
+def _zeronvs_pose(batch: PairBatch) -> Float[Tensor, "b 19"]:
+    scale = depth_scale(batch.reference_depths[:, 0], every=4, least=1e-2)
+    return zeronvs_pose(batch.reference_cameras[:, 0], batch.camera, scale)
