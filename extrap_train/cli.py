@@ -29,7 +29,7 @@ _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS)
 _GROUPS: dict[str, list[type]] = {
     "category": [schema.CategoryConfig],
     "data": [schema.SyntheticConfig, schema.Co3dConfig],
-    "depth": [schema.DatasetDepthConfig, schema.StereoConfig],
+    "depth": [schema.DatasetDepthConfig, schema.StereoConfig, schema.Mast3rConfig],
     "matcher": [schema.FlowMatcherConfig],
     "model": [schema.ModelConfig],
 }

@@ -4,7 +4,7 @@ Light on purpose (no torch), so that `--help` is instant. YAMLs under `conf/` ch
 variants of a group; this package says what may stand in them.
 """
 
-from extrap_train.config.checks import validate
+from extrap_train.config.checks import required_file, validate
 from extrap_train.config.commands import DataPrepConfig, TrainConfig
 from extrap_train.config.data import (
     CATEGORIES,
@@ -14,7 +14,7 @@ from extrap_train.config.data import (
     PrepConfig,
     SyntheticConfig,
 )
-from extrap_train.config.depth import DatasetDepthConfig, DepthConfig, StereoConfig
+from extrap_train.config.depth import DatasetDepthConfig, DepthConfig, Mast3rConfig, StereoConfig
 from extrap_train.config.matching import FlowMatcherConfig, MatcherConfig
 from extrap_train.config.model import (
     FAMILIES,
@@ -39,6 +39,7 @@ __all__ = [
     "DatasetDepthConfig",
     "DepthConfig",
     "FlowMatcherConfig",
+    "Mast3rConfig",
     "MatcherConfig",
     "ModelConfig",
     "PrepConfig",
@@ -51,5 +52,6 @@ __all__ = [
     "VaeConfig",
     "ValidationConfig",
     "dotted",
+    "required_file",
     "validate",
 ]

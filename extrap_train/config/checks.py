@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import asdict
+from typing import Any
 
 from extrap_train.config.commands import DataPrepConfig, TrainConfig
 from extrap_train.config.data import Co3dConfig, PrepConfig
@@ -62,12 +63,23 @@ def validate(config: TrainConfig | DataPrepConfig, tasks: tuple[str, ...]) -> No
     _check_prep(config.prep)
     if isinstance(config.data, Co3dConfig) and not config.data.root:
         raise InputError("data=co3d needs the folder of the download: give data.root=FOLDER")
+    for group in ("depth", "matcher"):
+        part: Any = getattr(config, group, None)
+        if hasattr(part, "checkpoint"):
+            required_file(part.checkpoint, f"{group}.checkpoint", part.weights)
     if isinstance(config, TrainConfig):
         _check_one_of("task", config.task, tasks)
         _check_one_of("trainer.precision", config.trainer.precision, _PRECISIONS)
         _check_model(config.model, config.prep)
         if config.sampler.compat is not None:
             _check_one_of("sampler.compat", config.sampler.compat, ("megascenes",))
+
+
+def required_file(path: str | None, option: str, content: str) -> str:
+    """`path`, if it was given; else InputError that says what `option` wants."""
+    if not path:
+        raise InputError(f"{option} is not given: give {option}=FILE, {content}")
+    return path
 
 
 def _check_bounds(config: TrainConfig | DataPrepConfig) -> None:

@@ -1,6 +1,7 @@
 """Where depth comes from."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from extrap_train.config.tree import MISSING
 
@@ -30,3 +31,23 @@ class StereoConfig(DepthConfig):
     """Other views that vote."""
     image_size: int = 256
     """Longer side that depth is estimated at, in pixels."""
+
+
+@dataclass
+class Mast3rConfig(DepthConfig):
+    """MASt3R's or DUSt3R's point maps of view pairs."""
+
+    name: str = "mast3r"
+    checkpoint: str | None = None
+    """File of weights; needed."""
+    weights: ClassVar[str] = (
+        "weights of MASt3R or DUSt3R, for instance "
+        "MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric.pth of github.com/naver/mast3r"
+    )
+    neighbours: int = 4
+    """Most pairs that a view looks for."""
+    image_size: int = 512
+    """Longer side that the network sees, in pixels: what its weights were trained on."""
+    square: bool = False
+    """Show square pictures whole; the published 512-pixel weights know 4:3 and wider only, to which
+    squares are cut otherwise: no depth in their upper and lower eighth."""

@@ -1,18 +1,40 @@
 """A depth source from its options."""
 
-from extrap_train.config import DatasetDepthConfig, DepthConfig, StereoConfig
+from pathlib import Path
+
+import torch
+
+from extrap_train.config import (
+    DatasetDepthConfig,
+    DepthConfig,
+    Mast3rConfig,
+    StereoConfig,
+    required_file,
+)
 from extrap_train.depth import DepthSource
 from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth.mast3r.checkpoint import read_network
+from extrap_train.depth.mast3r.source import Mast3rDepth
 from extrap_train.depth.stereo import PlaneSweepStereo
 from extrap_train.errors import InputError
 
 
 def depth_source(config: DepthConfig) -> DepthSource:
-    """The source that the type of `config` stands for."""
+    """The source that the type of `config` stands for; InputError where its weights cannot be used.
+
+    A network runs on the GPU where there is one.
+    """
     match config:
         case DatasetDepthConfig():
             return DatasetDepth()
         case StereoConfig():
             return PlaneSweepStereo(config)
+        case Mast3rConfig():
+            path = required_file(config.checkpoint, "depth.checkpoint", config.weights)
+            return Mast3rDepth(config, read_network(Path(path)).to(_device()))
         case _:
-            raise InputError(f"depth={config.name}: unknown; choose dataset or stereo")
+            raise InputError(f"depth={config.name}: unknown; choose dataset, stereo or mast3r")
+
+
+def _device() -> torch.device:
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")

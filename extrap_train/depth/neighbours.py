@@ -12,16 +12,19 @@ from extrap_train.views import Camera
 NEAREST_RAD, FARTHEST_RAD = math.radians(6), math.radians(18)
 """Seen from the scene's centre: nearer and depth is vague, farther and surfaces look different."""
 LEAST_RAD, LIMIT_RAD = math.radians(3), math.radians(45)
-"""Outside, views never help: those of the same place agree at any depth."""
+"""Outside, views never help in stereo: those of the same place agree at any depth."""
 
 
 def choose_neighbours(
-    cameras: list[Camera], center: Float[Tensor, "3"] | None, count: int
+    cameras: list[Camera],
+    center: Float[Tensor, "3"] | None,
+    count: int,
+    limit_rad: float = LIMIT_RAD,
 ) -> list[list[int]]:
     """For every camera the indices of up to `count` others, by turns from its left and its right.
 
-    Angles are those at `center`; without one (cameras that look the same way) the nearest cameras
-    are taken.
+    Angles are those at `center`, up to `limit_rad`; without one (cameras that look the same way)
+    the nearest cameras are taken.
     """
     positions = torch.stack([camera.center for camera in cameras])
     rights = torch.stack([camera.world_to_cam[0, :3] for camera in cameras])
@@ -30,16 +33,16 @@ def choose_neighbours(
         badness = torch.cdist(positions, positions)
         badness = torch.where(badness > 0, badness, torch.inf)
     else:
-        badness = _badness(positions - center)
+        badness = _badness(positions - center, limit_rad)
     return [_by_turns(badness[i], on_right[i], count) for i in range(len(cameras))]
 
 
-def _badness(offsets: Float[Tensor, "n 3"]) -> Float[Tensor, "n n"]:
+def _badness(offsets: Float[Tensor, "n 3"], limit_rad: float) -> Float[Tensor, "n n"]:
     """How far an angle is from the useful range, then from its middle; infinite if useless."""
     directions = offsets / offsets.norm(dim=-1, keepdim=True)
     angle_rad = torch.acos((directions @ directions.mT).clamp(-1, 1)).fill_diagonal_(torch.inf)
     outside = (NEAREST_RAD - angle_rad).clamp_min(0) + (angle_rad - FARTHEST_RAD).clamp_min(0)
-    useful = (angle_rad >= LEAST_RAD) & (angle_rad <= LIMIT_RAD)
+    useful = (angle_rad >= LEAST_RAD) & (angle_rad <= limit_rad)
     middle = (angle_rad - (NEAREST_RAD + FARTHEST_RAD) / 2).abs()
     return torch.where(useful, 10 * outside + middle, torch.inf)
 

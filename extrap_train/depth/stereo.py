@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn import functional
 
 from extrap_train.config import StereoConfig
 from extrap_train.depth import DepthMap, PointMaps, point_maps_of
@@ -14,11 +13,9 @@ from extrap_train.depth.consistency import agreement, forward_backward_error
 from extrap_train.depth.depth_range import convergence_point, inverse_depth_range
 from extrap_train.depth.neighbours import choose_neighbours
 from extrap_train.depth.plane_sweep import Estimate, sweep
+from extrap_train.depth.resample import resampled
 from extrap_train.errors import InputError
 from extrap_train.views import View
-
-SAME_SURFACE = 0.02
-"""Relative difference of depth below which an enlarged map is interpolated."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +85,7 @@ class PlaneSweepStereo:
         for i in wanted:
             height, width = views[i].camera.height, views[i].camera.width
             if helpers[i]:
-                maps.append(_enlarged(_checked(i, helpers[i], working, estimates), height, width))
+                maps.append(resampled(_checked(i, helpers[i], working, estimates), height, width))
             else:
                 maps.append(DepthMap(*views[i].image.new_zeros(2, height, width)))
         return maps
@@ -132,17 +129,3 @@ def _checked(
         for other in helpers
     ]
     return DepthMap(1 / own.inverse_depth, own.likeness * agreement(torch.stack(errors)))
-
-
-def _enlarged(depth_map: DepthMap, height: int, width: int) -> DepthMap:
-    """At the size of the photograph: interpolated on a surface, by nearest pixel at edges."""
-    size = (height, width)
-    if depth_map.depth.shape == size:
-        return depth_map
-    both = torch.stack([depth_map.depth, depth_map.confidence])[None]
-    nearest = functional.interpolate(both, size, mode="nearest-exact")[0]
-    smooth = functional.interpolate(both, size, mode="bilinear", align_corners=False)[0]
-    same = (smooth[0] - nearest[0]).abs() < SAME_SURFACE * nearest[0]
-    return DepthMap(
-        torch.where(same, smooth[0], nearest[0]), torch.where(same, smooth[1], nearest[1])
-    )

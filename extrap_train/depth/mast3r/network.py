@@ -1,0 +1,137 @@
+"""The network: both pictures encoded alike, decoded with an eye on each other."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from extrap_train.depth.mast3r.attention import (
+    NORM_EPS,
+    DecoderBlock,
+    EncoderBlock,
+    token_positions,
+)
+from extrap_train.depth.mast3r.heads import POINT_CHANNELS, DensePointHead, LinearPointHead
+
+Head = Literal["dense", "linear"]
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """Sizes of the network; the defaults are those of the published MASt3R (ViT-Large)."""
+
+    encoder_width: int = 1024
+    encoder_depth: int = 24
+    encoder_heads: int = 16
+    decoder_width: int = 768
+    decoder_depth: int = 12
+    decoder_heads: int = 12
+    patch: int = 16
+    head: Head = "dense"
+    descriptor_width: int | None = 24
+    """None for DUSt3R, which has no descriptors."""
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """Tokens of one picture, of `grid` (rows, columns) patches."""
+
+    tokens: Float[Tensor, "b n width"]
+    grid: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What the network says of one picture of a pair, in the *first* camera's frame; its scale is
+    the network's own."""
+
+    points: Float[Tensor, "b h w 3"]
+    confidence: Float[Tensor, "b h w"]
+    """From 1 (none) upwards."""
+    descriptors: Float[Tensor, "b h w d"] | None
+    """Unit length; alike where both pictures show the same."""
+    descriptor_confidence: Float[Tensor, "b h w"] | None
+    """From 0 upwards."""
+
+
+class _PatchEmbedding(nn.Module):
+    def __init__(self, width: int, patch: int) -> None:
+        super().__init__()
+        self.proj = nn.Conv2d(3, width, patch, stride=patch)
+
+
+class PointMapNetwork(nn.Module):
+    """Two views in, a point per pixel of both out. Colours are (x − ½) / ½."""
+
+    def __init__(self, architecture: Architecture) -> None:
+        super().__init__()
+        a = self.architecture = architecture
+        self.patch_embed = _PatchEmbedding(a.encoder_width, a.patch)
+        self.mask_token = nn.Parameter(torch.zeros(1, 1, a.decoder_width))
+        """Of the pre-training; part of the weights, without use here."""
+        self.enc_blocks = nn.ModuleList(
+            EncoderBlock(a.encoder_width, a.encoder_heads) for _ in range(a.encoder_depth)
+        )
+        self.enc_norm = nn.LayerNorm(a.encoder_width, NORM_EPS)
+        self.decoder_embed = nn.Linear(a.encoder_width, a.decoder_width)
+        self.dec_blocks, self.dec_blocks2 = (
+            nn.ModuleList(
+                DecoderBlock(a.decoder_width, a.decoder_heads) for _ in range(a.decoder_depth)
+            )
+            for _ in range(2)
+        )
+        self.dec_norm = nn.LayerNorm(a.decoder_width, NORM_EPS)
+        self.downstream_head1, self.downstream_head2 = (_head(a) for _ in range(2))
+
+    def encode(self, images: Float[Tensor, "b 3 h w"]) -> Encoding:
+        """Tokens of pictures whose sides are multiples of the patch; shared by all their pairs."""
+        patches = self.patch_embed.proj(images)
+        grid = (patches.shape[-2], patches.shape[-1])
+        tokens = patches.flatten(2).mT
+        positions = token_positions(*grid, device=images.device)
+        for block in self.enc_blocks:
+            tokens = block(tokens, positions)
+        return Encoding(self.enc_norm(tokens), grid)
+
+    def decode(self, first: Encoding, second: Encoding) -> tuple[Prediction, Prediction]:
+        """Both pictures' points in the first camera's frame."""
+        here = token_positions(*first.grid, device=first.tokens.device)
+        there = token_positions(*second.grid, device=second.tokens.device)
+        one, two = self.decoder_embed(first.tokens), self.decoder_embed(second.tokens)
+        ones, twos = [first.tokens], [second.tokens]
+        for block_one, block_two in zip(self.dec_blocks, self.dec_blocks2, strict=True):
+            one, two = block_one(one, two, here, there), block_two(two, one, there, here)
+            ones.append(one)
+            twos.append(two)
+        ones[-1], twos[-1] = self.dec_norm(one), self.dec_norm(two)
+        return (
+            _activated(self.downstream_head1(ones, first.grid)),
+            _activated(self.downstream_head2(twos, second.grid)),
+        )
+
+    def forward(
+        self, first: Float[Tensor, "b 3 h w"], second: Float[Tensor, "b 3 h2 w2"]
+    ) -> tuple[Prediction, Prediction]:
+        """`encode` and `decode` of one pair."""
+        return self.decode(self.encode(first), self.encode(second))
+
+
+def _head(a: Architecture) -> nn.Module:
+    if a.head == "linear":
+        return LinearPointHead(a.decoder_width, a.patch)
+    return DensePointHead(a.encoder_width, a.decoder_width, a.patch, a.descriptor_width)
+
+
+def _activated(raw: Float[Tensor, "b c h w"]) -> Prediction:
+    """Points leave the origin exponentially; confidences are exponentials, too."""
+    values = raw.permute(0, 2, 3, 1)
+    points, confidence = values[..., :3], 1 + values[..., 3].exp()
+    distance = points.norm(dim=-1, keepdim=True)
+    points = points / distance.clamp_min(1e-8) * distance.expm1()
+    local = values[..., POINT_CHANNELS:]
+    if not local.shape[-1]:
+        return Prediction(points, confidence, None, None)
+    descriptors = local[..., :-1] / local[..., :-1].norm(dim=-1, keepdim=True)
+    return Prediction(points, confidence, descriptors, local[..., -1].exp())

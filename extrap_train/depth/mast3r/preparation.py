@@ -1,0 +1,63 @@
+"""Pictures at the size that the network was trained on, and depth back at their own."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from extrap_train.depth import DepthMap
+from extrap_train.depth.resample import resampled
+from extrap_train.errors import InputError
+from extrap_train.views import View
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How a view becomes the network's: resampled, then cropped around its middle."""
+
+    resized: tuple[int, int]
+    """(height, width) before the crop."""
+    top: int
+    left: int
+    height: int
+    width: int
+
+    def apply(self, view: View) -> View:
+        """The network's view; its camera sees what the crop shows."""
+        return view.resized(*self.resized).cropped(self.top, self.left, self.height, self.width)
+
+    def undo(self, depth_map: DepthMap, height: int, width: int) -> DepthMap:
+        """Depth of the crop as depth of the view that it came from; unknown (0) outside."""
+        below = self.resized[0] - self.top - self.height
+        right = self.resized[1] - self.left - self.width
+        margins = (self.left, right, self.top, below)
+        whole = DepthMap(
+            functional.pad(depth_map.depth, margins), functional.pad(depth_map.confidence, margins)
+        )
+        return resampled(whole, height, width)
+
+
+def fit(view: View, image_size: int, patch: int, square: bool) -> Fit:
+    """The longer side becomes `image_size`, both are cut to multiples of `patch`.
+
+    Unless `square`, a square picture is cut to 4:3, the squarest shape that the published networks
+    of 512 pixels know. InputError where a picture is too narrow for a single patch.
+    """
+    scale = image_size / max(view.camera.height, view.camera.width)
+    resized = round(view.camera.height * scale), round(view.camera.width * scale)
+    height, width = (side // patch * patch for side in resized)
+    if height == width and not square:
+        height = max(height * 3 // 4 // patch, 1) * patch
+    if not height or not width:
+        raise InputError(
+            f"{view.name or 'a view'}: {view.camera.height} x {view.camera.width} pixels are too "
+            f"narrow for depth.image_size={image_size}, at which a side has under {patch}"
+        )
+    return Fit(resized, (resized[0] - height) // 2, (resized[1] - width) // 2, height, width)
+
+
+def network_input(view: View, device: torch.device) -> Float[Tensor, "1 3 h w"]:
+    """Colours as the network wants them, in [−1, 1]."""
+    return (view.image[None].to(device) - 0.5) / 0.5

@@ -1,0 +1,126 @@
+"""Depth of posed views from a pairwise point-map network."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+
+from extrap_train.config import Mast3rConfig
+from extrap_train.depth import DepthMap, PointMaps, point_maps_of
+from extrap_train.depth.depth_range import convergence_point
+from extrap_train.depth.fusion import fused
+from extrap_train.depth.mast3r.network import Encoding, PointMapNetwork
+from extrap_train.depth.mast3r.posed import posed_depths
+from extrap_train.depth.mast3r.preparation import Fit, fit, network_input
+from extrap_train.depth.neighbours import choose_neighbours
+from extrap_train.errors import InputError
+from extrap_train.views import Camera, View, combine
+
+WIDEST_RAD = math.radians(90)
+"""Between two views of a pair, seen from the scene's centre."""
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    """A view as the network sees it, with the way back."""
+
+    view: View
+    fit: Fit
+    camera: Camera
+    """Of what the network sees."""
+    encoding: Encoding
+
+    def undone(self, depth_map: DepthMap) -> DepthMap:
+        """Depth of what the network sees as depth of the view, where the view's picture lies."""
+        back = self.fit.undo(depth_map, self.view.camera.height, self.view.camera.width)
+        return combine([back], lambda tensors: tensors[0].to(self.view.image))
+
+
+@dataclass(frozen=True)
+class Mast3rDepth:
+    """Each pair gives both its views a depth; known cameras stay as they are, and set the scale.
+
+    Confidence is from 0 to 1: the network's own, less where pairs disagree.
+    """
+
+    config: Mast3rConfig
+    network: PointMapNetwork = field(repr=False, compare=False)
+
+    @property
+    def image_size(self) -> int:
+        """Longer side that depth is estimated at, in pixels."""
+        return self.config.image_size
+
+    def point_maps(self, first: View, second: View) -> PointMaps:
+        """Both views' points in the first camera's frame, in scene units.
+
+        InputError where the pair's scale cannot be found: no baseline, or nothing in common.
+        """
+        found = self._pair(self._prepare(first), self._prepare(second))
+        if found is None:
+            names = " and ".join(view.name or "a view" for view in (first, second))
+            raise InputError(
+                f"{names}: their cameras have no baseline, or they show too little in common for "
+                "depth=mast3r; leave one of them out"
+            )
+        return point_maps_of(first, found[0], second, found[1])
+
+    def depth_map(self, view: View, neighbours: Sequence[View]) -> DepthMap:
+        """One view's depth from its pairs with the most useful neighbours.
+
+        InputError if none of them makes a pair whose scale is known.
+        """
+        helpers = self._neighbours([view, *neighbours])[0]
+        estimates = self._estimates([view, *neighbours], {(0, other) for other in helpers})[0]
+        if not estimates:
+            raise InputError(
+                f"{view.name or 'a view'}: no other view shows enough of the same from another "
+                "place, which depth=mast3r needs; use depth=dataset or add photographs"
+            )
+        return fused(estimates)
+
+    def depth_maps(self, views: Sequence[View]) -> list[DepthMap]:
+        """The depth of every view of a capture; 0, unknown, where no pair can be used."""
+        pairs = {
+            (min(i, j), max(i, j))
+            for i, others in enumerate(self._neighbours(views))
+            for j in others
+        }
+        estimates = self._estimates(views, pairs)
+        return [
+            fused(estimates[i]) if estimates[i] else DepthMap(*torch.zeros_like(view.image[:2]))
+            for i, view in enumerate(views)
+        ]
+
+    def _neighbours(self, views: Sequence[View]) -> list[list[int]]:
+        cameras = [view.camera for view in views]
+        center = convergence_point(cameras)
+        return choose_neighbours(cameras, center, self.config.neighbours, WIDEST_RAD)
+
+    def _estimates(
+        self, views: Sequence[View], pairs: set[tuple[int, int]]
+    ) -> list[list[DepthMap]]:
+        """For every view what each of its pairs says; a view is encoded once for all of them."""
+        prepared = {i: self._prepare(views[i]) for i in sorted({i for pair in pairs for i in pair})}
+        estimates: list[list[DepthMap]] = [[] for _ in views]
+        for i, j in sorted(pairs):
+            found = self._pair(prepared[i], prepared[j])
+            if found is not None:
+                estimates[i].append(found[0])
+                estimates[j].append(found[1])
+        return estimates
+
+    @torch.no_grad()
+    def _prepare(self, view: View) -> _Prepared:
+        patch, device = self.network.architecture.patch, self.network.mask_token.device
+        how = fit(view, self.config.image_size, patch, self.config.square)
+        small = how.apply(view)
+        encoding = self.network.encode(network_input(small, device))
+        return _Prepared(view, how, small.camera, encoding)
+
+    @torch.no_grad()
+    def _pair(self, first: _Prepared, second: _Prepared) -> tuple[DepthMap, DepthMap] | None:
+        predictions = self.network.decode(first.encoding, second.encoding)
+        found = posed_depths(*predictions, first.camera, second.camera)
+        return found and (first.undone(found[0]), second.undone(found[1]))
