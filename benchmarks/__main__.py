@@ -9,7 +9,7 @@ from pathlib import Path
 from extrap_train.config import CATEGORIES
 from extrap_train.errors import InputError
 
-PERF_NAMES = ("warp",)
+PERF_NAMES = ("align", "warp")
 LISTS = {"categories": CATEGORIES}
 
 

@@ -39,14 +39,19 @@ def _compare(size: int, device: torch.device) -> Row:
 
 def bumpy_views(size: int) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n c"]]:
     """World points of three views of a bumpy ball before a wall, with random values."""
-    v, u = torch.meshgrid(*2 * [torch.linspace(-1, 1, size)], indexing="ij")
-    ball = (0.5 - u.square() - v.square()).clamp(min=0).sqrt()
-    depth = 3.0 - 1.2 * ball + 0.05 * torch.sin(9 * u) * torch.cos(7 * v)
-    depth = torch.where(ball > 0, depth, 4.0)
+    depth = bumpy_depth(size)
     points = [unproject_to_world(depth, orbit_camera(angle, size)) for angle in ANGLES_DEG]
     generator = torch.Generator().manual_seed(0)
     values = torch.rand(len(points) * size * size, CHANNELS, generator=generator)
     return torch.cat([x.reshape(-1, 3) for x in points]), values
+
+
+def bumpy_depth(size: int) -> Float[Tensor, "h w"]:
+    """Depth of a bumpy ball before a wall."""
+    v, u = torch.meshgrid(*2 * [torch.linspace(-1, 1, size)], indexing="ij")
+    ball = (0.5 - u.square() - v.square()).clamp(min=0).sqrt()
+    depth = 3.0 - 1.2 * ball + 0.05 * torch.sin(9 * u) * torch.cos(7 * v)
+    return torch.where(ball > 0, depth, 4.0)
 
 
 def orbit_camera(azimuth_deg: float, size: int) -> Camera:

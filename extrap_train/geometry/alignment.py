@@ -1,0 +1,217 @@
+"""Depth of one new view against views that are known already, in closed form (METHOD §5.4; paper
+II-C).
+
+Every edge, a pair of point maps in a frame and a unit of its own, is placed in the world by the
+similarity that brings the known view's points to where they are known to lie; what the edge then
+says of the new view is a depth for every pixel, and the new depth is a robust mean over the edges.
+Nothing but the new view is estimated. The widths of all robust kernels come from the residuals, so
+neither the scene's unit nor the source's noise has to be known.
+"""
+
+import math
+from dataclasses import dataclass
+
+import roma
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from extrap_train.geometry.cameras import pixel_grid, transform
+from extrap_train.views import Camera
+
+MOST_PAIRS = 4096
+"""Point pairs, spread over the image, that an edge's similarity is fitted to."""
+MOST_RANKED = 1024
+"""Residuals, spread over the image, that a kernel's width is taken from."""
+SIMILARITY_ROUNDS = 5
+FUSION_ROUNDS = 3
+LEAST_PAIRS = 16
+"""An edge with fewer usable pairs says nothing."""
+WIDTH = 4.685
+"""Of Tukey's biweight in standard deviations: 95 % efficient on Gaussian noise."""
+_CHI3_MEDIAN = 1.538
+"""Median length of a 3-D Gaussian vector, in standard deviations of a coordinate."""
+_GAUSSIAN_MEDIAN = 0.6745
+_FAR_WORSE = 3.0
+_LEAST_SPREAD = 1e-6
+"""Relative residuals below are rounding."""
+
+
+@dataclass(frozen=True)
+class Edges:
+    """Point maps of a new view paired with known views; each edge in its own frame and unit."""
+
+    new_points: Float[Tensor, "e h w 3"]
+    new_confidence: Float[Tensor, "e h w"]
+    """Not negative; 0 where the point means nothing."""
+    known_points: Float[Tensor, "e n 3"]
+    known_confidence: Float[Tensor, "e n"]
+    world_points: Float[Tensor, "e n 3"]
+    """Where the known view's points lie."""
+    world_known: Bool[Tensor, "e n"]
+    """False where the known view has no depth."""
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """The new view's depth, and how the edges agree on it."""
+
+    depth: Float[Tensor, "h w"]
+    """0 where no usable edge says anything."""
+    confidence: Float[Tensor, "h w"]
+    """The edges' mean confidence, times the share of them that agrees."""
+    edge_to_world: Float[Tensor, "e 4 4"]
+    """Similarities; meaningless for edges that are not `usable`."""
+    spread: Float[Tensor, " e"]
+    """Standard deviation of each edge's relative error on the known view, outliers aside."""
+    usable: Bool[Tensor, " e"]
+
+
+def align_view(camera: Camera, edges: Edges) -> Alignment:
+    """Solve for the depth of the (unbatched) new view with everything known frozen."""
+    pairs = _pairs(edges)
+    usable = (pairs.weight > 0).sum(-1) >= LEAST_PAIRS
+    edge_to_world, spread = _similarities(pairs)
+    usable &= torch.isfinite(edge_to_world).all(-1).all(-1)
+    edge_to_world = torch.where(usable[:, None, None], edge_to_world, torch.eye(4).to(spread))
+    depths = _depths_along_rays(camera, camera.world_to_cam @ edge_to_world, edges.new_points)
+    known = usable[:, None, None] & (depths > 0) & torch.isfinite(depths)
+    confidence = torch.where(known, edges.new_confidence, 0)
+    depth, agreement = _robust_mean(depths, confidence, _trust(spread, usable))
+    count = (confidence > 0).sum(0)
+    mean_confidence = confidence.sum(0) / count.clamp(min=1)
+    return Alignment(depth, mean_confidence * agreement, edge_to_world, spread, usable)
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    edge: Float[Tensor, "e m 3"]
+    world: Float[Tensor, "e m 3"]
+    weight: Float[Tensor, "e m"]
+
+
+def _pairs(edges: Edges) -> _Pairs:
+    """An even choice of the known views' points, weighted by what their confidence ranks."""
+    stride = max(1, math.ceil(edges.known_points.shape[1] / MOST_PAIRS))
+    edge, world = edges.known_points[:, ::stride], edges.world_points[:, ::stride]
+    finite = torch.isfinite(edge).all(-1) & torch.isfinite(world).all(-1)
+    used = finite & edges.world_known[:, ::stride]
+    weight = torch.where(used, _weight(edges.known_confidence[:, ::stride]), 0)
+    return _Pairs(
+        torch.where(used[..., None], edge, 0), torch.where(used[..., None], world, 0), weight
+    )
+
+
+def _weight(confidence: Tensor) -> Tensor:
+    """Compressed: networks' confidences grow without bound."""
+    return torch.log1p(confidence.clamp(min=0))
+
+
+def _similarities(pairs: _Pairs) -> tuple[Float[Tensor, "e 4 4"], Float[Tensor, " e"]]:
+    """Robust weighted Procrustes by reweighting, and the spread of its relative residuals.
+
+    Fitted from the world to the edge and inverted: noise is in the edge's points alone, and as
+    regressors they would shrink the scale.
+    """
+    robust = torch.ones_like(pairs.weight)
+    for step in range(SIMILARITY_ROUNDS):
+        weight = (pairs.weight * robust).clamp(min=1e-12)
+        rotation, shift, scale = roma.rigid_points_registration(
+            pairs.world, pairs.edge, weights=weight, compute_scaling=True
+        )
+        fitted = scale[:, None, None] * (pairs.world @ rotation.mT) + shift[:, None]
+        residual = (fitted - pairs.edge).norm(dim=-1)
+        relative = residual / _extent(pairs)[:, None]
+        median = _masked_median(relative, pairs.weight > 0)
+        sigma = (median / _CHI3_MEDIAN).clamp(min=_LEAST_SPREAD)
+        ratio = relative / sigma[:, None]
+        # A convex kernel finds the basin, a redescending one forgets what lies outside of it.
+        last = step >= SIMILARITY_ROUNDS // 2
+        robust = _biweight(ratio / (WIDTH * 1.5)) if last else 1 / (1 + ratio)
+    inverse_scale = 1 / scale
+    linear = inverse_scale[:, None, None] * rotation.mT
+    matrix = torch.eye(4).to(linear).repeat(len(linear), 1, 1)
+    matrix[:, :3, :3] = linear
+    matrix[:, :3, 3] = -(linear @ shift[..., None])[..., 0]
+    return matrix, sigma
+
+
+def _trust(spread: Float[Tensor, " e"], usable: Bool[Tensor, " e"]) -> Float[Tensor, " e"]:
+    """Less for an edge that fits far worse than most do; no more for one that fits better.
+
+    A good fit to the known view is no proof: smooth errors vanish in it and stay in the new one.
+    """
+    median = _masked_median(spread[None], usable[None])
+    return 1 / (1 + (spread / (_FAR_WORSE * median.clamp(min=_LEAST_SPREAD))).square())
+
+
+def _extent(pairs: _Pairs) -> Float[Tensor, " e"]:
+    """Mean distance of each edge's points from their middle, in the edge's unit."""
+    used = (pairs.weight > 0).to(pairs.edge.dtype)[..., None]
+    count = used.sum(1).clamp(min=1)
+    middle = (pairs.edge * used).sum(1) / count
+    away = ((pairs.edge - middle[:, None]) * used).norm(dim=-1).sum(1) / count[:, 0]
+    return away.clamp(min=1e-30)
+
+
+def _depths_along_rays(
+    camera: Camera, edge_to_cam: Float[Tensor, "e 4 4"], points: Float[Tensor, "e h w 3"]
+) -> Float[Tensor, "e h w"]:
+    """The depth whose point on each pixel's ray is nearest to the edge's point."""
+    grid = pixel_grid(camera.height, camera.width, points.device).to(points.dtype)
+    k = camera.intrinsics
+    x, y = (grid[..., 0] - k[0, 2]) / k[0, 0], (grid[..., 1] - k[1, 2]) / k[1, 1]
+    in_cam = transform(edge_to_cam, points.flatten(1, 2)).view_as(points)
+    along = in_cam[..., 0] * x + in_cam[..., 1] * y + in_cam[..., 2]
+    return along / (x.square() + y.square() + 1)
+
+
+def _robust_mean(
+    depths: Float[Tensor, "e h w"],
+    confidence: Float[Tensor, "e h w"],
+    trust: Float[Tensor, " e"],
+) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+    """Redescending mean of log depth over the edges, and the share of confidence that agrees."""
+    known = confidence > 0
+    log = torch.where(known, depths, 1).log()
+    weight = _weight(confidence)
+    center = _weighted_median(log, weight)
+    reliable = weight * trust[:, None, None]
+    robust = known.to(log.dtype)
+    for _ in range(FUSION_ROUNDS):
+        residual = (log - center).abs()
+        several = known & (known.sum(0) > 1)
+        sigma = _masked_median(residual.flatten()[None], several.flatten()[None])
+        sigma = (sigma / _GAUSSIAN_MEDIAN).clamp(min=_LEAST_SPREAD)
+        robust = _biweight(residual / (WIDTH * sigma)) * known
+        total = (reliable * robust).sum(0)
+        mean = (reliable * robust * log).sum(0) / total.clamp(min=1e-30)
+        center = torch.where(total > 0, mean, center)
+    agreement = (weight * robust).sum(0) / weight.sum(0).clamp(min=1e-30)
+    return torch.where(known.any(0), center.exp(), 0), agreement
+
+
+def _biweight(ratio: Tensor) -> Tensor:
+    """Tukey's weight: 1 at 0, falling to 0 at 1 and beyond."""
+    return (1 - ratio.square()).clamp(min=0).square()
+
+
+def _weighted_median(values: Float[Tensor, "e h w"], weight: Float[Tensor, "e h w"]) -> Tensor:
+    """Along the first dimension: the value with the least weighted distance from all.
+
+    Ties are averaged; where no weight is positive it means nothing.
+    """
+    distance = torch.stack([((values - one).abs() * weight).sum(0) for one in values])
+    distance = torch.where(weight > 0, distance, torch.inf)
+    least = distance == distance.amin(0)
+    return (values * least).sum(0) / least.sum(0)
+
+
+def _masked_median(values: Float[Tensor, "e n"], mask: Bool[Tensor, "e n"]) -> Float[Tensor, " e"]:
+    """The lower median of each row's masked entries, of an even choice of them; 0 without any."""
+    stride = max(1, values.shape[1] // MOST_RANKED)
+    chosen = mask[:, ::stride]
+    ordered = torch.where(chosen, values[:, ::stride], torch.inf).sort(-1).values
+    index = ((chosen.sum(-1) - 1) // 2).clamp(min=0)
+    found = ordered.gather(-1, index[:, None])[:, 0]
+    return torch.where(chosen.any(-1), found, 0)
