@@ -22,6 +22,7 @@ def _run(config: DataPrepConfig) -> None:
             config.prep,
             output=Path(config.output),
             workers=config.workers or len(os.sched_getaffinity(0)),
+            launcher=config.launcher,
         )
         write_report(prepared, Console())
 

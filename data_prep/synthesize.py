@@ -1,13 +1,9 @@
 """Synthetic categories on disk, in the layout of CO3D's second release."""
 
 import json
-import multiprocessing
 import os
 import shutil
-import threading
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +22,8 @@ from extrap_train.data.synthetic import (
     surface_points,
     walk_seed,
 )
+from extrap_train.errors import InputError
+from extrap_train.jobs import Died, Launcher
 
 LOOK = 2
 """Raised whenever the same options give other pictures, so that old ones are not mixed with new."""
@@ -38,23 +36,29 @@ CLOUD_POINTS = 20_000
 class _Job:
     """One sequence to render."""
 
+    root: Path
     category: str
     index: int
     options: dict[str, int]
 
     @property
     def name(self) -> str:
-        """The sequence's folder."""
+        """Of the sequence, and of its folder."""
         return sequence_name(self.index)
 
+    @property
+    def folder(self) -> Path:
+        """Where the sequence is to lie."""
+        return self.root / self.category / self.name
 
-def synthesize(config: SyntheticConfig, category: str, root: Path, workers: int) -> None:
+
+def synthesize(config: SyntheticConfig, category: str, root: Path, launcher: Launcher) -> None:
     """Render the sequences of a category that `root` lacks, and annotate all that are asked for.
 
     Sequences 0 … `test_sequences` − 1 are the test split; asking for more training sequences keeps
-    every sequence there is. Files are the same, bit for bit, for any number of `workers`. Sequences
-    made with other options are replaced, with a message. Raises InputError for an unknown category
-    and where the disk is full.
+    every sequence there is. Files are the same, bit for bit, with any launcher. Sequences made with
+    other options are replaced, with a message. Raises InputError for an unknown category and where
+    the disk is full.
     """
     options = {
         "look": LOOK,
@@ -63,21 +67,20 @@ def synthesize(config: SyntheticConfig, category: str, root: Path, workers: int)
         "image_size": config.image_size,
     }
     count = config.test_sequences + config.train_sequences
-    jobs = [_Job(category, index, options) for index in range(count)]
-    states = [_state(root, job) for job in jobs]
+    jobs = [_Job(root, category, index, options) for index in range(count)]
+    states = [_state(job) for job in jobs]
     missing = [job for job, state in zip(jobs, states, strict=True) if state != "ready"]
     _announce(category, root, states)
-    _render_all(missing, root, workers)
-    records = [_read_record(root / category / job.name) for job in jobs]
+    _render_all(missing, launcher)
+    records = [_read_record(job.folder) for job in jobs]
     _annotate(root, category, [record for record in records if record], config.test_sequences)
 
 
-def _state(root: Path, job: _Job) -> str:
+def _state(job: _Job) -> str:
     """`ready`, `missing`, or `outdated`: made with other options."""
-    folder = root / job.category / job.name
-    if not folder.exists():
+    if not job.folder.exists():
         return "missing"
-    record = _read_record(folder)
+    record = _read_record(job.folder)
     return "ready" if record is not None and record["options"] == job.options else "outdated"
 
 
@@ -96,46 +99,19 @@ def _announce(category: str, root: Path, states: list[str]) -> None:
         print(f"{root / category}: {ready} of {len(states)} sequences are there already")
 
 
-def _render_all(jobs: list[_Job], root: Path, workers: int) -> None:
-    """Renders the jobs in up to `workers` processes, with a progress bar."""
+def _render_all(jobs: list[_Job], launcher: Launcher) -> None:
+    """Renders the jobs, with a progress bar."""
     if not jobs:
         return
-    label = f"render {jobs[0].category}"
-    if workers <= 1 or len(jobs) == 1:
-        for job in tqdm(jobs, label, unit="sequence"):
-            _render_sequence(root, job)
-        return
-    # Spawned, not forked: the parent may hold threads and a GPU.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(
-        min(workers, len(jobs)),
-        mp_context=context,
-        initializer=_prepare_worker,
-    ) as pool:
-        futures = [pool.submit(_render_sequence, root, job) for job in jobs]
-        try:
-            for future in tqdm(as_completed(futures), label, len(jobs), unit="sequence"):
-                future.result()
-        finally:
-            pool.shutdown(cancel_futures=True)
+    done = launcher.run(_render_sequence, jobs)
+    for index, result in tqdm(done, f"render {jobs[0].category}", len(jobs), unit="sequence"):
+        if isinstance(result, Died):
+            raise InputError(f"{jobs[index].folder}: not rendered: {result.reason}")
 
 
-def _prepare_worker() -> None:
-    """One thread a worker, and no worker without its parent: a killed run leaves none behind."""
-    torch.set_num_threads(1)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def follow() -> None:
-        wait([parent.sentinel])
-        os._exit(1)
-
-    threading.Thread(target=follow, daemon=True).start()
-
-
-def _render_sequence(root: Path, job: _Job) -> None:
+def _render_sequence(job: _Job) -> None:
     """Render into a folder beside the final one, then rename it."""
-    options = job.options
+    root, options = job.root, job.options
     scene = build_scene(job.category, job.index, options["seed"])
     seed = walk_seed(job.category, job.index, options["seed"])
     cameras = handheld_orbit(scene, options["frames"], options["image_size"], seed)
@@ -156,10 +132,9 @@ def _render_sequence(root: Path, job: _Job) -> None:
         made = workshop / job.category / job.name
         record = {"options": options, "frames": frames, "sequence": sequence}
         write_whole(made / RECORD, json.dumps(record).encode())
-        final = root / job.category / job.name
-        if final.exists():
-            shutil.rmtree(final)
-        made.rename(final)
+        if job.folder.exists():
+            shutil.rmtree(job.folder)
+        made.rename(job.folder)
     finally:
         shutil.rmtree(workshop, ignore_errors=True)
 

@@ -31,6 +31,7 @@ _GROUPS: dict[str, list[type]] = {
     "data": [schema.SyntheticConfig, schema.Co3dConfig],
     "depth": [schema.DatasetDepthConfig, schema.StereoConfig, schema.Mast3rConfig],
     "matcher": [schema.FlowMatcherConfig],
+    "launcher": [schema.LocalConfig, schema.SlurmConfig],
     "model": [schema.ModelConfig],
 }
 

@@ -13,6 +13,7 @@ _RANK = {
     "extrap_train.config": 1,
     "extrap_train.weight_files": 1,
     "extrap_train.views": 1,
+    "extrap_train.jobs": 2,
     "extrap_train.geometry": 2,
     "extrap_train.depth": 3,
     "extrap_train.matching": 3,

@@ -15,6 +15,7 @@ from extrap_train.config.data import (
     SyntheticConfig,
 )
 from extrap_train.config.depth import DatasetDepthConfig, DepthConfig, Mast3rConfig, StereoConfig
+from extrap_train.config.launcher import LauncherConfig, LocalConfig, SlurmConfig
 from extrap_train.config.matching import FlowMatcherConfig, MatcherConfig
 from extrap_train.config.model import (
     FAMILIES,
@@ -39,11 +40,14 @@ __all__ = [
     "DatasetDepthConfig",
     "DepthConfig",
     "FlowMatcherConfig",
+    "LauncherConfig",
+    "LocalConfig",
     "Mast3rConfig",
     "MatcherConfig",
     "ModelConfig",
     "PrepConfig",
     "SamplerConfig",
+    "SlurmConfig",
     "StereoConfig",
     "SyntheticConfig",
     "TrainConfig",

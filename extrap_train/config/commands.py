@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 from extrap_train.config.data import CategoryConfig, DataConfig, PrepConfig
 from extrap_train.config.depth import DepthConfig
+from extrap_train.config.launcher import LauncherConfig
 from extrap_train.config.model import ModelConfig, SamplerConfig
 from extrap_train.config.training import TrainerConfig, ValidationConfig
 from extrap_train.config.tree import MISSING
@@ -40,7 +41,8 @@ class DataPrepConfig:
     category: CategoryConfig = MISSING
     data: DataConfig = MISSING
     depth: DepthConfig = MISSING
+    launcher: LauncherConfig = MISSING
     prep: PrepConfig = field(default_factory=PrepConfig)
     output: str = "outputs"
     workers: int | None = None
-    """Sequences that are rendered or prepared at a time; null takes every core."""
+    """Processes on this machine; null takes every core."""

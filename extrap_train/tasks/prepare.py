@@ -15,6 +15,8 @@ from extrap_train.config import (
     Co3dConfig,
     DataConfig,
     DepthConfig,
+    LauncherConfig,
+    LocalConfig,
     PrepConfig,
     SyntheticConfig,
 )
@@ -22,6 +24,10 @@ from extrap_train.data.co3d import read_category
 from extrap_train.data.sequences import Sequence
 from extrap_train.data.store import PreparedData
 from extrap_train.depth.build import depth_source
+from extrap_train.jobs import Launcher
+from extrap_train.jobs.build import open_launcher
+
+LOCAL = LocalConfig()
 
 
 def prepare_category(
@@ -32,13 +38,17 @@ def prepare_category(
     *,
     output: Path,
     workers: int,
+    launcher: LauncherConfig = LOCAL,
 ) -> PreparedData:
     """Sequences of one category as pairs on disk; what is there already is used again."""
     folder = output / "data" / f"{category}-{_digest(category, data, depth, prep)}"
     folder.parent.mkdir(parents=True, exist_ok=True)
     # The jobs of a sweep share their data: the first one makes it, the others wait.
-    with FileLock(folder.parent / f".{category}.lock"):
-        sequences, test_names = _sequences(category, data, output, workers)
+    with (
+        FileLock(folder.parent / f".{category}.lock"),
+        open_launcher(launcher, workers, folder.parent / "slurm") as opened,
+    ):
+        sequences, test_names = _sequences(category, data, output, opened)
         return prepare(
             sequences,
             depth_source(depth),
@@ -50,11 +60,11 @@ def prepare_category(
 
 
 def _sequences(
-    category: str, data: DataConfig, output: Path, workers: int
+    category: str, data: DataConfig, output: Path, launcher: Launcher
 ) -> tuple[list[Sequence], set[str] | int]:
     if isinstance(data, SyntheticConfig):
         root = Path(data.root) if data.root else output / "synthetic"
-        synthesize(data, category, root, workers)
+        synthesize(data, category, root, launcher)
         wanted = {f"{i:04d}" for i in range(data.test_sequences + data.train_sequences)}
         sequences = [s for s in read_category(root, category) if s.name in wanted]
         return sequences, {f"{i:04d}" for i in range(data.test_sequences)}

@@ -14,6 +14,7 @@ from extrap_train.config import SyntheticConfig
 from extrap_train.data.co3d import read_category
 from extrap_train.data.synthetic import build_scene, handheld_orbit, render, walk_seed
 from extrap_train.errors import InputError
+from extrap_train.jobs.local import LocalLauncher
 
 SMALL = SyntheticConfig(test_sequences=1, train_sequences=2, frames=3, image_size=16)
 
@@ -29,7 +30,7 @@ def times(root: Path, name: str) -> dict[str, int]:
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("synthetic")
-    synthesize(SMALL, "apple", root, workers=1)
+    synthesize(SMALL, "apple", root, LocalLauncher(1))
     return root
 
 
@@ -53,14 +54,15 @@ def test_the_reader_finds_what_was_rendered(made):
 
 
 def test_the_same_files_for_any_number_of_workers(made, tmp_path):
-    synthesize(SMALL, "apple", tmp_path, workers=2)
+    with LocalLauncher(2) as launcher:
+        synthesize(SMALL, "apple", tmp_path, launcher)
     assert contents(tmp_path) == contents(made)
 
 
 def test_only_what_is_missing_is_rendered(root, made, capsys):
     before = times(root, "0000")
     shutil.rmtree(root / "apple" / "0001")
-    synthesize(SMALL, "apple", root, workers=1)
+    synthesize(SMALL, "apple", root, LocalLauncher(1))
     assert times(root, "0000") == before
     assert contents(root) == contents(made)
     assert "2 of 3 sequences are there already" in capsys.readouterr().out
@@ -68,33 +70,33 @@ def test_only_what_is_missing_is_rendered(root, made, capsys):
 
 def test_what_a_killed_run_left_behind_is_made_anew(root, made):
     (root / "apple" / "0002" / "synthetic.json").unlink()
-    synthesize(SMALL, "apple", root, workers=1)
+    synthesize(SMALL, "apple", root, LocalLauncher(1))
     assert contents(root) == contents(made)
 
 
 def test_more_training_sequences_keep_the_test_sequences(root):
     before = times(root, "0000")
-    synthesize(replace(SMALL, train_sequences=3), "apple", root, workers=1)
+    synthesize(replace(SMALL, train_sequences=3), "apple", root, LocalLauncher(1))
     assert times(root, "0000") == before
     assert len(read_category(root, "apple")) == 4
 
 
 def test_other_options_replace_the_sequences_and_say_so(root, capsys):
-    synthesize(replace(SMALL, frames=2), "apple", root, workers=1)
+    synthesize(replace(SMALL, frames=2), "apple", root, LocalLauncher(1))
     assert "3 sequences were made with other options" in capsys.readouterr().out
     assert [len(sequence.frames) for sequence in read_category(root, "apple")] == [2, 2, 2]
 
 
 def test_an_unknown_category_leaves_nothing_behind(tmp_path):
     with pytest.raises(InputError, match="no synthetic category"):
-        synthesize(SMALL, "toaster", tmp_path, workers=1)
+        synthesize(SMALL, "toaster", tmp_path, LocalLauncher(1))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_full_disk_is_one_line(tmp_path):
     (tmp_path / "apple").write_text("a file where a folder belongs")
     with pytest.raises(InputError, match="cannot be written"):
-        synthesize(SMALL, "apple", tmp_path, workers=1)
+        synthesize(SMALL, "apple", tmp_path, LocalLauncher(1))
 
 
 def test_the_gallery_has_a_row_for_each_category():

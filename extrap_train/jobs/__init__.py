@@ -1,0 +1,34 @@
+"""Independent jobs that leave files behind: in this process, in several, or as a SLURM job array.
+
+A job is a function at a module's top level and an item; both are pickled. Its files are its result:
+what it returns is a small record, and a job that finds its files finished returns at once. So
+nothing is lost when any of this is killed, and the same command goes on where it stopped.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class Died:
+    """In place of a result: the process that ran the job ended without one, and once more alone."""
+
+    reason: str
+
+
+class Launcher(Protocol):
+    """Where jobs run."""
+
+    def run(
+        self, job: Callable[[Item], Result], items: Sequence[Item]
+    ) -> Iterator[tuple[int, Result | Died]]:
+        """Each item's index with its result, in the order in which they are done.
+
+        An exception of a job is raised here and ends everything, so a job returns what the others
+        are to survive. A job that takes its process with it (memory) is tried once more, alone.
+        """
+        ...

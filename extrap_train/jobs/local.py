@@ -1,0 +1,115 @@
+"""Jobs on this machine. No torch here: a worker says how many threads it has before that loads."""
+
+import multiprocessing
+import os
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import wait as wait_for_any
+from types import TracebackType
+
+from extrap_train.jobs import Died, Item, Result
+
+WAITING_PER_WORKER = 2
+"""Jobs that are handed out ahead of time: memory must not grow with the number of jobs."""
+_ONE_THREAD = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+
+
+class LocalLauncher:
+    """A pool of processes of one thread each, or just this process where `workers` is 1.
+
+    A context manager: the pool starts with the first jobs, serves any number of runs, and ends
+    with the context. No worker outlives its parent, however that ends.
+    """
+
+    def __init__(self, workers: int) -> None:
+        self.workers = workers
+        self._pool: ProcessPoolExecutor | None = None
+
+    def __enter__(self) -> "LocalLauncher":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._close()
+
+    def run(
+        self, job: Callable[[Item], Result], items: Sequence[Item]
+    ) -> Iterator[tuple[int, Result | Died]]:
+        """See `Launcher`."""
+        if self.workers == 1 or len(items) <= 1:
+            yield from ((index, job(item)) for index, item in enumerate(items))
+            return
+        suspects: list[int] = []
+        yield from self._run_in_pool(job, items, suspects)
+        for index in suspects:
+            again: list[int] = []
+            with LocalLauncher(2) as alone:
+                yield from (
+                    (index, result) for _, result in alone._run_in_pool(job, [items[index]], again)
+                )
+            if again:
+                yield index, Died("its process was killed, probably for want of memory")
+
+    def _run_in_pool(
+        self, job: Callable[[Item], Result], items: Sequence[Item], suspects: list[int]
+    ) -> Iterator[tuple[int, Result]]:
+        """Whatever was under way when a process died goes to `suspects`."""
+        running: dict[Future[Result], int] = {}
+        waiting = iter(range(len(items)))
+        try:
+            while True:
+                for index in waiting:
+                    running[self._submit(job, items[index])] = index
+                    if len(running) >= self.workers * WAITING_PER_WORKER:
+                        break
+                if not running:
+                    return
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    index = running.pop(future)
+                    try:
+                        result = future.result()
+                    except BrokenProcessPool:
+                        suspects.append(index)
+                    else:
+                        yield index, result
+        finally:
+            for future in running:
+                future.cancel()
+
+    def _submit(self, job: Callable[[Item], Result], item: Item) -> "Future[Result]":
+        if self._pool is not None:
+            try:
+                return self._pool.submit(job, item)
+            except BrokenProcessPool:
+                self._close()
+        # Spawned, not forked: the parent may hold threads and a GPU.
+        self._pool = ProcessPoolExecutor(
+            self.workers,
+            mp_context=multiprocessing.get_context("spawn"),
+            initializer=_prepare_worker,
+        )
+        return self._pool.submit(job, item)
+
+    def _close(self) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+            self._pool = None
+
+
+def _prepare_worker() -> None:
+    """One thread a worker, and no worker without its parent: a killed run leaves none behind."""
+    os.environ |= dict.fromkeys(_ONE_THREAD, "1")
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def follow() -> None:
+        wait_for_any([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=follow, daemon=True).start()

@@ -1,0 +1,108 @@
+"""Jobs as one SLURM job array, through submitit."""
+
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from extrap_train.config import SlurmConfig
+from extrap_train.errors import InputError
+from extrap_train.jobs import Died, Item, Result
+
+
+class SubmittedLauncher:
+    """Array tasks of a submitit executor; each runs its share of the items one after another.
+
+    It waits for all of them, because whoever submits puts the results together. Interrupted, it
+    cancels the tasks; killed, they go on, and the same command later finds what they made.
+    """
+
+    def __init__(self, executor: Any, tasks: int, poll_seconds: float = 5.0) -> None:
+        self.executor, self.tasks, self.poll_seconds = executor, tasks, poll_seconds
+
+    def run(
+        self, job: Callable[[Item], Result], items: Sequence[Item]
+    ) -> Iterator[tuple[int, Result | Died]]:
+        """See `Launcher`."""
+        dealt = [list(range(first, len(items), self.tasks)) for first in range(self.tasks)]
+        suspects: dict[int, str] = {}
+        yield from self._run_shares(job, items, dealt, suspects)
+        alone = [[index] for index in suspects]
+        for start in range(0, len(alone), self.tasks):
+            died: dict[int, str] = {}
+            yield from self._run_shares(job, items, alone[start : start + self.tasks], died)
+            yield from ((index, Died(reason)) for index, reason in died.items())
+
+    def _run_shares(
+        self,
+        job: Callable[[Item], Result],
+        items: Sequence[Item],
+        shares: Sequence[list[int]],
+        died: dict[int, str],
+    ) -> Iterator[tuple[int, Result]]:
+        """One array task a share; the items of a task that ended without a result go to `died`."""
+        from submitit.core.utils import UncompletedJobError
+        from submitit.helpers import as_completed
+
+        shares = [share for share in shares if share]
+        if not shares:
+            return
+        parts = [[items[index] for index in share] for share in shares]
+        submitted = self.executor.map_array(_run_share, [job] * len(parts), parts)
+        share_of = {task.job_id: share for task, share in zip(submitted, shares, strict=True)}
+        try:
+            for task in as_completed(submitted, poll_frequency=self.poll_seconds):
+                share = share_of[task.job_id]
+                try:
+                    results = task.result()
+                except UncompletedJobError:
+                    reason = f"its SLURM task ended early; see {task.paths.stderr}"
+                    died |= dict.fromkeys(share, reason)
+                    continue
+                if isinstance(results, BaseException):
+                    raise results
+                yield from zip(share, results, strict=True)
+        finally:
+            for task in submitted:
+                if not task.done():
+                    task.cancel()
+
+
+def _run_share(
+    job: Callable[[Item], Result], items: Sequence[Item]
+) -> list[Result] | BaseException:
+    """The results, or what one job raised: as an object, which submitit would turn into text."""
+    try:
+        return [job(item) for item in items]
+    except Exception as error:
+        return error
+
+
+def slurm_launcher(config: SlurmConfig, folder: Path) -> SubmittedLauncher:
+    """A launcher for the cluster that this machine submits to; logs and results go to `folder`.
+
+    Raises InputError where submitit or SLURM is not there.
+    """
+    try:
+        import submitit
+    except ImportError:
+        raise InputError(
+            "launcher=slurm needs submitit: pip install 'extrap-train[slurm]'"
+        ) from None
+    if shutil.which("sbatch") is None:
+        raise InputError(
+            "launcher=slurm: there is no sbatch on this machine; submit from a login node of the "
+            "cluster, or leave launcher=local"
+        )
+    executor = submitit.SlurmExecutor(folder)
+    optional = {"partition": config.partition, "account": config.account}
+    executor.update_parameters(
+        job_name="extrap-train",
+        time=max(1, round(config.hours * 60)),
+        cpus_per_task=config.cpus,
+        mem=f"{round(config.memory_gib * 1024)}M",
+        array_parallelism=config.at_once,
+        additional_parameters=dict(config.directives),
+        **{name: value for name, value in optional.items() if value is not None},
+    )
+    return SubmittedLauncher(executor, config.tasks)

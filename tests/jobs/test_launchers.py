@@ -1,0 +1,125 @@
+"""Every launcher gives every result once, survives a job that kills its process, and stops at an
+exception.
+"""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from extrap_train.config import SlurmConfig
+from extrap_train.errors import InputError
+from extrap_train.jobs import Died, Launcher
+from extrap_train.jobs.local import LocalLauncher
+from extrap_train.jobs.slurm import SubmittedLauncher, slurm_launcher
+
+
+def square(number: int) -> int:
+    return number * number
+
+
+def square_or_die(number: int) -> int:
+    if number == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number * number
+
+
+def square_or_fill_the_disk(number: int) -> int:
+    if number == 1:
+        raise OSError(errno.ENOSPC, "no space")
+    return number * number
+
+
+def submitted(folder: Path, tasks: int) -> SubmittedLauncher:
+    import submitit
+
+    return SubmittedLauncher(submitit.LocalExecutor(folder), tasks, poll_seconds=0.05)
+
+
+@pytest.fixture(autouse=True)
+def _jobs_are_found_by_other_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    here = str(Path(__file__).parent)
+    monkeypatch.setenv("PYTHONPATH", f"{here}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+
+
+@pytest.fixture(params=["here", "processes", "submitted"])
+def launcher(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Launcher]:
+    if request.param == "submitted":
+        yield submitted(tmp_path, 3)
+        return
+    with LocalLauncher(1 if request.param == "here" else 2) as local:
+        yield local
+
+
+def test_every_item_has_its_result_once(launcher: Launcher) -> None:
+    done = list(launcher.run(square, range(7)))
+    assert sorted(done) == [(i, i * i) for i in range(7)]
+    assert list(launcher.run(square, [])) == []
+
+
+def test_an_exception_ends_everything_and_keeps_its_kind(launcher: Launcher) -> None:
+    with pytest.raises(OSError, match="no space") as caught:
+        list(launcher.run(square_or_fill_the_disk, range(4)))
+    assert caught.value.errno == errno.ENOSPC
+
+
+@pytest.mark.parametrize(
+    "kind",
+    # submitit waits a quarter of a minute for the result of a process that was killed.
+    ["processes", pytest.param("submitted", marks=pytest.mark.slow)],
+)
+def test_a_job_that_takes_its_process_along_harms_no_other(kind: str, tmp_path: Path) -> None:
+    with LocalLauncher(2) as processes:
+        launcher = processes if kind == "processes" else submitted(tmp_path, 2)
+        done = dict(launcher.run(square_or_die, range(6)))
+    assert isinstance(done.pop(3), Died)
+    assert done == {i: i * i for i in range(6) if i != 3}
+
+
+def test_workers_do_not_outlive_a_killed_parent(tmp_path: Path) -> None:
+    program = (
+        "from test_launchers import linger\n"
+        "from extrap_train.jobs.local import LocalLauncher\n"
+        "if __name__ == '__main__':\n"
+        "    with LocalLauncher(2) as local:\n"
+        f"        list(local.run(linger, [{str(tmp_path)!r}] * 2))\n"
+    )
+    script = tmp_path / "parent.py"
+    script.write_text(program)
+    parent = subprocess.Popen([sys.executable, str(script)])
+    while len(list(tmp_path.glob("*.pid"))) < 2:
+        assert parent.poll() is None
+        time.sleep(0.02)
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    pids = [int(path.stem) for path in tmp_path.glob("*.pid")]
+    deadline = time.monotonic() + 10
+    while any(map(_is_alive, pids)):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def linger(folder: str) -> None:
+    (Path(folder) / f"{os.getpid()}.pid").touch()
+    time.sleep(60)
+
+
+def _is_alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def test_a_machine_without_slurm_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(InputError, match=r"no sbatch on this machine; .*launcher=local"):
+        slurm_launcher(SlurmConfig(), tmp_path)
