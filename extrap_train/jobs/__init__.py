@@ -7,7 +7,7 @@ nothing is lost when any of this is killed, and the same command goes on where i
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -20,6 +20,7 @@ class Died:
     reason: str
 
 
+@runtime_checkable
 class Launcher(Protocol):
     """Where jobs run."""
 
