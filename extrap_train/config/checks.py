@@ -49,6 +49,7 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "trainer.steps": (1, math.inf),
     "trainer.batch_size": (1, math.inf),
     "trainer.warmup_steps": (0, math.inf),
+    "trainer.full_rate_steps": (1, math.inf),
     "trainer.condition_dropout": (0, 1),
     "trainer.ema_decay": (0, 1),
     "trainer.devices": (1, math.inf),
@@ -114,10 +115,10 @@ def _check_model(model: ModelConfig, prep: PrepConfig) -> None:
             f"model.residual=true needs the fused warp, which model.family={model.family} is not "
             "told: give model.residual=false"
         )
-    if model.image_size != prep.image_size:
+    if prep.image_size % model.image_size:
         raise InputError(
-            f"model.image_size={model.image_size} but "
-            f"prep.image_size={prep.image_size}: give both the same"
+            f"prep.image_size={prep.image_size} is no multiple of "
+            f"model.image_size={model.image_size}: give twice the latter, or the same"
         )
     groups = model.unet.norm_groups
     odd = [width for width in model.unet.channels if width <= 0 or width % groups]

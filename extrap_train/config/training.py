@@ -10,6 +10,10 @@ class TrainerConfig:
     steps: int = 1200
     batch_size: int = 16
     warmup_steps: int = 100
+    full_rate_steps: int = 3000
+    """Steps at the full learning rate; from there it falls as 1/√step (Karras et al. 2024), which,
+    unlike a decay towards a last step, leaves a run that can be prolonged.
+    """
     condition_dropout: float = 0.05
     """Share of the training examples whose condition is the null condition."""
     ema_decay: float = 0.999

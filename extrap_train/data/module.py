@@ -9,6 +9,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from extrap_train.data.examples import ExampleReader, mirrored
+from extrap_train.geometry.reduction import reduced_batch
 from extrap_train.geometry.warp import warp_references
 from extrap_train.views import PairBatch
 
@@ -16,8 +17,12 @@ Positions = list[tuple[int, int]]
 """(position in the endless stream of examples, index of the pair)."""
 
 
-def with_warp(batch: PairBatch) -> PairBatch:
-    """The batch with its warp, made on the device where the batch lies."""
+def with_warp(batch: PairBatch, image_size: int | None = None) -> PairBatch:
+    """The batch with its warp, made on the device where the batch lies.
+
+    The warp is made at the batch's own size; then everything is reduced to `image_size`, of which
+    that size is a multiple. None keeps it.
+    """
     if batch.warp is not None:
         return batch
     warp = warp_references(
@@ -27,7 +32,8 @@ def with_warp(batch: PairBatch) -> PairBatch:
         batch.reference_valid,
         batch.camera,
     )
-    return replace(batch, warp=warp)
+    factor = 1 if image_size is None else batch.camera.height // image_size
+    return reduced_batch(replace(batch, warp=warp), factor)
 
 
 class PositionSampler(Sampler[Positions]):
@@ -113,6 +119,7 @@ class PairModule(lightning.LightningDataModule):
         train: ExampleReader,
         validation: ExampleReader,
         *,
+        image_size: int,
         batch_size: int,
         batches_per_epoch: int,
         validation_examples: int,
@@ -123,6 +130,7 @@ class PairModule(lightning.LightningDataModule):
     ) -> None:
         super().__init__()
         self.train, self.validation = train, validation
+        self.image_size = image_size
         self.batch_size, self.batches_per_epoch = batch_size, batches_per_epoch
         self.validation_batch_size, self.references = validation_batch_size, references
         self.workers, self.seed = workers, seed
@@ -164,7 +172,7 @@ class PairModule(lightning.LightningDataModule):
 
     def on_after_batch_transfer(self, batch: PairBatch, dataloader_idx: int) -> PairBatch:
         """Lightning's hook: warps are computed, not stored."""
-        return with_warp(batch)
+        return with_warp(batch, self.image_size)
 
 
 def spread(available: int, wanted: int) -> list[int]:

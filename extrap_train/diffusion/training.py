@@ -10,8 +10,7 @@ from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 from torch.nn import functional
 
-from extrap_train.config import TrainConfig
-from extrap_train.data.module import with_warp
+from extrap_train.config import TrainConfig, TrainerConfig
 from extrap_train.diffusion.evaluation import (
     Distance,
     Prediction,
@@ -92,7 +91,7 @@ class CategoryTraining(lightning.LightningModule):
 
     def validation_step(self, batch: PairBatch, batch_idx: int) -> None:
         """Sample the batch's queries."""
-        named = [(with_warp(batch), self.validation_names[batch_idx])]
+        named = [(batch, self.validation_names[batch_idx])]
         self.predictions += predict(self.model, named, self.config.sampler, self.config.seed)
 
     def on_validation_epoch_start(self) -> None:
@@ -125,7 +124,7 @@ class CategoryTraining(lightning.LightningModule):
         return first_views(self.predictions, self.config.validation.pictures)
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
-        """AdamW with a linear warm-up to a constant rate, as MegaScenes trains."""
+        """AdamW with a linear warm-up, as MegaScenes trains, and a late inverse-root decay."""
         model, trainer = self.config.model, self.config.trainer
         optimizer = torch.optim.AdamW(
             self.model.parameters(),
@@ -134,7 +133,11 @@ class CategoryTraining(lightning.LightningModule):
             betas=(0.9, 0.99),
             fused=True,
         )
-        warmup = torch.optim.lr_scheduler.LambdaLR(
-            optimizer, lambda step: min(1.0, (step + 1) / max(1, trainer.warmup_steps))
-        )
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": warmup, "interval": "step"}}
+        rate = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: rate_at(step, trainer))
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": rate, "interval": "step"}}
+
+
+def rate_at(step: int, options: TrainerConfig) -> float:
+    """Share of the learning rate at a step: linear warm-up, full, then falling as 1/√step."""
+    warm = min(1.0, (step + 1) / max(1, options.warmup_steps))
+    return warm * min(1.0, (options.full_rate_steps / max(1, step)) ** 0.5)

@@ -140,6 +140,7 @@ def _data_module(config: TrainConfig, prepared: list[PreparedData]) -> PairModul
     return PairModule(
         train,
         validation,
+        image_size=config.model.image_size,
         batch_size=config.trainer.batch_size,
         batches_per_epoch=min(config.trainer.checkpoint_every, config.trainer.steps),
         validation_examples=config.validation.examples,
