@@ -49,7 +49,10 @@ def _error(arguments: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
         (["-m", "category=hydrnt,apple"], "did you mean hydrant"),
         (["category=hydrant", "task=scne"], "task=scne is unknown; known: category"),
         (["category=hydrant", "model.prediction=eps"], "known: epsilon, v_prediction, sample"),
-        (["category=hydrant", "model.image_size=96"], "prep.image_size=128 is no multiple of model.image_size=96"),
+        (
+            ["category=hydrant", "model.image_size=96"],
+            "128 is no multiple of model.image_size=96",
+        ),
         (["category=hydrant", "model.patch=7"], "no multiple of 56"),
         (["category=hydrant", "data=co3d"], "give data.root=FOLDER"),
     ],

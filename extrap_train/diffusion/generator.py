@@ -13,6 +13,7 @@ from extrap_train.data.module import with_warp
 from extrap_train.data.queries import query_batch
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sample_views, view_generator
+from extrap_train.geometry.reduction import WARP_SCALE
 from extrap_train.views import Camera, View, Warp, combine
 
 
@@ -83,9 +84,10 @@ class DiffusionGenerator:
         self, references: Sequence[View], queries: Camera, names: Sequence[str], seed: int
     ) -> GeneratedViews:
         config = self.model.config
-        batch, chosen = query_batch(references, queries, config.references, config.image_size)
+        size = WARP_SCALE * config.image_size
+        batch, chosen = query_batch(references, queries, config.references, size)
         device = next(self.model.parameters()).device
-        batch = with_warp(batch.to(device))
+        batch = with_warp(batch.to(device), config.image_size)
         generators = [view_generator(seed, name) for name in names[: len(chosen)]]
         images = sample_views(self.model, batch, self.sampler, generators)
         assert batch.warp is not None

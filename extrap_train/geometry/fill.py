@@ -19,7 +19,7 @@ object's.
 def fill_holes(
     image: Float[Tensor, "b c h w"], mask: Float[Tensor, "b h w"]
 ) -> Float[Tensor, "b c h w"]:
-    """Fill where `mask` is 0: narrow holes from their rim, wide ones with the mean of what is known.
+    """Fill where `mask` is 0: narrow holes from their rim, wide ones with the mean of the known.
 
     Pull-push (Gortler et al., The Lumigraph, 1996, section 3.4.1) down to `_COARSEST_CELLS` a side:
     known pixels are averaged level by level, and each hole takes the finest level's colour that

@@ -12,6 +12,9 @@ from torch.nn import functional
 
 from extrap_train.views import PairBatch, Warp
 
+WARP_SCALE = 2
+"""Side of the warp over the model's where nothing else says it (`PrepConfig.image_size` does)."""
+
 
 def reduced_batch(batch: PairBatch, factor: int) -> PairBatch:
     """The batch with everything in it, its warp too, at 1/`factor` of its size.

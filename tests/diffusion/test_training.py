@@ -1,10 +1,11 @@
 """A step is a function of its seed, moves every weight, and learns."""
 
+import pytest
 import torch
 
-from extrap_train.config import ModelConfig
+from extrap_train.config import ModelConfig, TrainerConfig
 from extrap_train.diffusion.model import ExtrapolationModel
-from extrap_train.diffusion.training import diffusion_loss
+from extrap_train.diffusion.training import diffusion_loss, rate_at
 from extrap_train.views import PairBatch
 
 
@@ -59,3 +60,10 @@ def test_training_on_one_batch_lowers_its_loss(config: ModelConfig, batch: PairB
         diffusion_loss(model, batch, _generator(step), 0.0).backward()
         optimizer.step()
     assert measured() < 0.6 * before
+
+
+def test_the_rate_warms_up_stays_and_falls_as_the_inverse_root() -> None:
+    options = TrainerConfig(warmup_steps=10, full_rate_steps=100)
+    assert rate_at(0, options) == pytest.approx(0.1)
+    assert rate_at(9, options) == rate_at(100, options) == 1
+    assert rate_at(400, options) == pytest.approx(0.5)
