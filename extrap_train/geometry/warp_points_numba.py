@@ -15,6 +15,7 @@ from extrap_train.geometry import warp_points, warp_walls
 from extrap_train.geometry.compiled import compiled
 from extrap_train.geometry.encoding import coordinate_grid
 from extrap_train.geometry.normals_numba import find_surface
+from extrap_train.geometry.warp_frustum_numba import enters
 from extrap_train.geometry.warp_points import query_centers
 from extrap_train.geometry.warp_projection import LEAST_DEPTH_RATIO, reference_to_query_pixels
 from extrap_train.geometry.warp_walls_numba import draw_walls, project
@@ -96,24 +97,27 @@ def _cut(
         draw_walls(inverse[r], links[r], intrinsics[r], matrix[r], unseen[r])
         surface = (inverse[r], slopes[r], valid)
         camera = (intrinsics[r], centers[r], matrix[r])
-        _cut_pixels(surface, camera, counts[:, r], reaches[:, r], sizes[r])
+        _cut_pixels(surface, camera, unseen[r].shape, counts[:, r], reaches[:, r], sizes[r])
 
 
 @compiled()
 def _cut_pixels(
     surface: tuple[np.ndarray, ...],
     camera: tuple[np.ndarray, ...],
+    query_size: tuple[int, int],
     counts: np.ndarray,
     reaches: np.ndarray,
     sizes: np.ndarray,
 ) -> None:
+    """Points and reach of each pixel; none where the query sees its back, or not even its rim."""
     inverse, slopes, valid = surface
     intrinsics, center, m = camera
     sizes[:] = 0
     for y in range(inverse.shape[0]):
         for x in range(inverse.shape[1]):
             across = down = 0
-            if valid[y, x] and _faces(inverse, slopes, intrinsics, center, y, x):
+            facing = valid[y, x] and _faces(inverse, slopes, intrinsics, center, y, x)
+            if facing and enters(m, inverse, slopes, y, x, query_size):
                 across, down, reaches[0, y, x], reaches[1, y, x] = _divide(m, inverse, slopes, y, x)
             counts[0, y, x], counts[1, y, x] = across, down
             sizes[y // _ROWS] += across * down

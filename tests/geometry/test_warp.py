@@ -126,11 +126,20 @@ def noisy(depths):
     return depths
 
 
+@pytest.mark.parametrize(
+    "query",
+    [
+        scenes.orbit_camera(25, size=80),
+        scenes.orbit_camera(25, distance=1.3, elevation_deg=50, size=48),
+        scenes.orbit_camera(140, distance=0.4, elevation_deg=-5, size=48, focal=0.5),
+    ],
+    ids=["beside", "close to the surface", "amid the scene"],
+)
 @pytest.mark.parametrize("change", [torch.clone, noisy], ids=["exact", "noisy"])
-def test_torch_and_numba_agree(change):
+def test_torch_and_numba_agree(change, query):
+    """Also where most of the surface lies outside the image, or behind it."""
     images, depths, cameras = references(scenes.SPHERE_ON_PLANE, [0, -30, 40], size=64)
     depths = change(depths)
-    query = scenes.orbit_camera(25, size=80)
     compiled = warp(images, depths, cameras, query)
     same(warp(images.clone().requires_grad_(), depths, cameras, query), compiled)
 
