@@ -1,0 +1,172 @@
+"""DNGaussian (Li et al., 2024): depth normalised over patches, for means and opacities apart."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from benchmarks.methods.gaussians.depth_losses import (
+    edge_aware_smoothness,
+    filled,
+    patch_depth_loss,
+)
+from benchmarks.methods.gaussians.drawing import Drawing, draw
+from benchmarks.methods.gaussians.gaussians import Gaussians
+from benchmarks.methods.gaussians.method import GaussianMethod
+from benchmarks.methods.gaussians.neural_colour import HashGrid, NeuralColor
+from benchmarks.methods.gaussians.parameters import GaussianParameters
+from benchmarks.methods.gaussians.priors import monocular_source, prior_depths
+from benchmarks.methods.gaussians.recipe import Objective, Recipe, Step, Training
+from benchmarks.methods.gaussians.scene import TrainingScene
+from extrap_train.views import Camera
+
+_OPAQUE = 0.2
+"""Opacities above are pulled to 1, those below, as in the released code, too."""
+
+
+@dataclass(frozen=True)
+class DnGaussian(GaussianMethod):
+    """Random points, moved by depth first; published values are those for LLFF."""
+
+    full_iterations: int = 6000
+    init: str = "random"
+    l1_weight: float = 1.0
+    means_rate: float = 0.016
+    means_rate_final: float = 1.6e-4
+    log_scales_rate: float = 3e-3
+    densify_until: int = 6000
+    densify_gradient: float = 1.3e-3
+    densify_least_opacity: float = 0.1
+    prune_opacity: float = 0.01
+    reset_every: int = 0
+
+    monocular: str = "surrogate"
+    """Where monocular depth comes from: `surrogate` or `depth_source`."""
+    hard_opacity: float = 0.95
+    soft_from: int = 1000
+    smooth_from: int = 3000
+    local_weight: float = 0.1
+    global_weight: float = 1.0
+    smooth_weight: float = 0.1
+    depth_tolerance: float = 0.00025
+    patch_range: tuple[int, int] = (5, 17)
+    """Least and greatest side of a patch in pixels; each term draws its own."""
+    shape_weight: float = 0.002
+    scale_weight: float = 0.001
+    opacity_weight: float = 0.001
+
+    color: str = "neural"
+    """`neural` (hash grid and networks) or `sh` (spherical harmonics)."""
+    hash_levels: int = 16
+    hash_log2_size: int = 19
+    hash_coarsest: int = 16
+    hash_finest: int = 512
+    hash_bound: float = 3.0
+    """Half the side of the cube that the grid covers, in extents."""
+    grid_rate: float = 5e-3
+    network_rate: float = 5e-4
+
+    def recipe(self, scene: TrainingScene) -> Recipe:
+        """Three optimiser steps an iteration."""
+        return DnGaussianRecipe(self, scene)
+
+
+class DnGaussianRecipe(Recipe):
+    """Hard depth moves means, soft depth opacities, and the photograph everything."""
+
+    options: DnGaussian
+
+    def __init__(self, options: DnGaussian, scene: TrainingScene) -> None:
+        super().__init__(options, scene)
+        source = monocular_source(scene, options.monocular)
+        self._priors = [filled(prior) for prior in prior_depths(scene, source)]
+        self._neural = None
+        if options.color == "neural":
+            with torch.random.fork_rng(devices=[]):
+                torch.manual_seed(scene.seed)
+                self._neural = NeuralColor(
+                    HashGrid(
+                        options.hash_levels,
+                        options.hash_log2_size,
+                        options.hash_coarsest,
+                        round(options.hash_finest * options.hash_bound),
+                        options.hash_bound,
+                    )
+                )
+        scene.record["color"] = options.color
+
+    def modules(self) -> Sequence[tuple[nn.Module, float, float]]:
+        """The grid and the networks, at rates that stay."""
+        if self._neural is None:
+            return ()
+        options, networks = self.options, nn.ModuleList()
+        networks.extend([self._neural.spatial, self._neural.directional])
+        return (
+            (self._neural.grid, options.grid_rate, options.grid_rate),
+            (networks, options.network_rate, options.network_rate),
+        )
+
+    def colors(self, parameters: GaussianParameters, camera: Camera) -> Float[Tensor, "n 3"] | None:
+        """The networks' colours, where they are asked for."""
+        if self._neural is None:
+            return None
+        means = parameters.means.detach()
+        directions = nn.functional.normalize(means - camera.center.detach(), dim=-1)
+        return self._neural(means, directions)
+
+    def steps(self, training: Training) -> Sequence[Step]:
+        """Hard depth, later soft depth, and the photograph."""
+        late = training.iteration > training.schedule.at(self.options.soft_from)
+        soft = (self._soft_step,) if late else ()
+        return (self._hard_step, *soft, self.photometric_step)
+
+    def regulariser(
+        self, training: Training, index: int, drawing: Drawing
+    ) -> Float[Tensor, ""] | float:
+        """Round, small, and either opaque or not (as coded: rather opaque)."""
+        options, now = self.options, training.optimiser.parameters
+        scales, opacities = now.scales, now.opacities
+        high = opacities > _OPAQUE
+        away = torch.where(high, -opacities.square(), 0).sum() / high.sum().clamp_min(1)
+        low = torch.where(high, 0, (1 - opacities).square()).sum() / (~high).sum().clamp_min(1)
+        return (
+            options.shape_weight * (scales.amax(1) / scales.amin(1)).mean()
+            + options.scale_weight * scales.amax(1).square().mean()
+            + options.opacity_weight * (1 + away + low)
+        )
+
+    def _hard_step(self, training: Training, index: int) -> Objective:
+        now = training.optimiser.parameters.gaussians()
+        opaque = torch.full_like(now.opacities, self.options.hard_opacity)
+        shown = replace(now, opacities=opaque, scales=now.scales.detach(), quats=now.quats.detach())
+        return Objective(self._depth_loss(training, index, shown))
+
+    def _soft_step(self, training: Training, index: int) -> Objective:
+        now = training.optimiser.parameters.gaussians()
+        shown = replace(
+            now, means=now.means.detach(), scales=now.scales.detach(), quats=now.quats.detach()
+        )
+        return Objective(self._depth_loss(training, index, shown))
+
+    def _depth_loss(
+        self, training: Training, index: int, gaussians: Gaussians
+    ) -> Float[Tensor, ""]:
+        """Local and global terms, each with a patch size of its own; smoothness later."""
+        options, prior = self.options, self._priors[index]
+        grey = torch.full_like(gaussians.means.detach(), 0.5)
+        depth = draw(
+            self._rasterize, gaussians, self.camera(index), self.background, 0, grey
+        ).depth  # fmt: skip
+        if not (prior > 0).any():
+            return depth.sum() * 0
+        loss = torch.zeros(())
+        for local, weight in ((True, options.local_weight), (False, options.global_weight)):
+            least, greatest = options.patch_range
+            drawn = torch.randint(least, greatest + 1, (1,), generator=training.generator)
+            term = patch_depth_loss(depth, prior, int(drawn), local, options.depth_tolerance)
+            loss = loss + weight * term
+        if training.iteration > training.schedule.at(options.smooth_from):
+            loss = loss + options.smooth_weight * edge_aware_smoothness(depth, prior)
+        return loss

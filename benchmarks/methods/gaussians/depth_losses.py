@@ -1,0 +1,98 @@
+"""Losses against monocular depth, which is known up to an affine map only."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+_LEAST_SPREAD = 1e-6
+_GLOBAL_SHARE = 0.01
+"""Of the image's spread that a patch's own is raised by (DNGaussian, released code)."""
+
+
+def pearson(first: Float[Tensor, "n"], second: Float[Tensor, "n"]) -> Float[Tensor, ""]:
+    """Correlation in [−1, 1]; 0 where one of them is constant."""
+    a, b = first - first.mean(), second - second.mean()
+    spread = a.norm() * b.norm()
+    return (a * b).sum() / spread.clamp_min(_LEAST_SPREAD**2)
+
+
+def pearson_depth_loss(
+    depth: Float[Tensor, "h w"], prior: Float[Tensor, "h w"]
+) -> Float[Tensor, ""]:
+    """1 − correlation with the prior, read as depth or as what networks mistake for it.
+
+    FSGS takes the better of two readings of a network's disparity (equation 8, released code): its
+    negative and its inverse. With a prior in depth (0 unknown) these are −1/prior and the prior.
+    """
+    known = prior > 0
+    if int(known.sum()) < 2:
+        return depth.sum() * 0
+    rendered, given = depth[known], prior[known]
+    readings = [1 - pearson(rendered, given), 1 - pearson(rendered, -1 / given)]
+    return torch.minimum(*readings)
+
+
+def patches(image: Float[Tensor, "h w"], size: int) -> Float[Tensor, "p k"]:
+    """The whole patches of `size`² pixels, side by side from the top left; the rest is left out."""
+    rows, columns = image.shape[0] // size, image.shape[1] // size
+    cut = image[: rows * size, : columns * size].reshape(rows, size, columns, size)
+    return cut.permute(0, 2, 1, 3).reshape(rows * columns, size * size)
+
+
+def normalised_patches(image: Float[Tensor, "h w"], size: int, local: bool) -> Float[Tensor, "p k"]:
+    """Patches less their mean, over their own spread (local) or the image's (global).
+
+    DNGaussian, section 3.3: the first shows small changes, the second keeps their relative size.
+    """
+    cut = patches(image, size)
+    centred = cut - cut.mean(1, keepdim=True)
+    whole = image.std()
+    spread = cut.std(1, keepdim=True) if local else whole.detach()
+    return centred / (spread + _GLOBAL_SHARE * whole).clamp_min(_LEAST_SPREAD)
+
+
+def patch_depth_loss(
+    depth: Float[Tensor, "h w"],
+    prior: Float[Tensor, "h w"],
+    size: int,
+    local: bool,
+    tolerance: float,
+) -> Float[Tensor, ""]:
+    """Mean squared difference of normalised patches, over those pixels that differ by more than
+    `tolerance`; 0 where none does.
+    """
+    size = min(size, *depth.shape)
+    difference = normalised_patches(depth, size, local) - normalised_patches(prior, size, local)
+    beyond = difference.abs() > tolerance
+    return (difference.square() * beyond).sum() / beyond.sum().clamp_min(1)
+
+
+def edge_aware_smoothness(
+    depth: Float[Tensor, "h w"], guide: Float[Tensor, "h w"]
+) -> Float[Tensor, ""]:
+    """Mean gradient of the depth, weighted down where the guide has an edge."""
+    total, weights = depth.new_zeros(()), depth.new_zeros(())
+    for axis in (0, 1):
+        weight = torch.exp(-guide.diff(dim=axis).abs())
+        total = total + (depth.diff(dim=axis).abs() * weight).sum()
+        weights = weights + weight.sum()
+    return total / weights
+
+
+def filled(prior: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """The prior with unknown pixels (0) at their neighbours' mean, nearer neighbours first.
+
+    Patch losses look at every pixel, and a network's prior has no holes; other sources' do.
+    """
+    known = (prior > 0).to(prior.dtype)
+    if not known.any() or known.all():
+        return prior
+    value, weight = prior * known, known
+    while not (weight > 0).all():
+        both = torch.stack([value, weight])[None]
+        spread = functional.avg_pool2d(both, 3, stride=1, padding=1, count_include_pad=False)[0]
+        mean = spread[0] / spread[1].clamp_min(1e-12)
+        new = (weight == 0) & (spread[1] > 0)
+        value, weight = torch.where(new, mean, value), torch.where(new, 1.0, weight)
+    return value

@@ -1,0 +1,171 @@
+"""The four methods on a ball in a round room: they learn, repeat, leak nothing, and say no."""
+
+import math
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+
+from benchmarks.methods.base import Method, SceneInputs
+from benchmarks.methods.dngaussian import DnGaussian
+from benchmarks.methods.fsgs import Fsgs
+from benchmarks.methods.gaussians.method import GaussianMethod
+from benchmarks.methods.gaussians.options import GaussianOptions
+from benchmarks.methods.gaussians.recipe import Recipe
+from benchmarks.methods.gaussians.scene import training_scene
+from benchmarks.methods.gaussians.trainer import Diverged, fit
+from benchmarks.methods.instantsplat import InstantSplat
+from benchmarks.methods.threedgs import ThreeDgs
+from extrap_train.depth import DepthMap
+from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.errors import InputError
+from extrap_train.geometry.cameras import unproject_to_world
+from extrap_train.metrics import psnr
+from tests.benchmarks.analytic import scene_inputs
+
+SMALL = {"iterations": 60, "full_iterations": 240, "init_points": 200, "max_gaussians": 400}
+METHODS: dict[str, GaussianMethod] = {
+    "3dgs": ThreeDgs(**SMALL),
+    "fsgs": Fsgs(**SMALL),
+    "dngaussian": DnGaussian(**SMALL | {"full_iterations": 6000}, hash_levels=4, hash_log2_size=10),
+    "instantsplat": InstantSplat(**SMALL),
+}
+each_method = pytest.mark.parametrize("name", METHODS)
+
+
+@each_method
+def test_it_is_a_method_that_learns_the_scene(name: str) -> None:
+    inputs, truth = scene_inputs(size=24)
+    method = METHODS[name]
+    assert isinstance(method, Method)
+    made = method.synthesize(inputs)
+    assert made.images.shape == truth.shape
+    assert made.images.min() >= 0
+    assert made.images.max() <= 1
+    assert 0 < made.counts["gaussians"] <= 400
+    assert "iterations" in made.given["schedule"]
+    assert "init" in made.given
+    untrained = replace(method, iterations=1).synthesize(inputs).images
+    assert psnr(made.images, truth).mean() > psnr(untrained, truth).mean() + 1
+
+
+@each_method
+def test_targets_change_nothing_that_is_learnt(name: str) -> None:
+    """Neither their poses nor their number: the same Gaussians, bit by bit, and the same views."""
+    inputs, _ = scene_inputs(targets_deg=(10.0, 60.0), size=16)
+    other, _ = scene_inputs(targets_deg=(200.0, 10.0, 300.0), size=16)
+    method = replace(METHODS[name], iterations=12)
+    first, second = method.fitted(inputs), method.fitted(other)
+    for key, value in first.parameters.tensors().items():
+        assert value.equal(second.parameters.tensors()[key]), key
+    assert first.record == second.record
+    assert first.render(inputs.targets)[0].equal(second.render(other.targets)[1])
+
+
+@each_method
+def test_an_input_changes_what_is_learnt(name: str) -> None:
+    """The counterpart: the test above would see a leak, for it sees a change of the inputs."""
+    inputs, _ = scene_inputs(size=16)
+    brighter = replace(inputs.views[0], image=(inputs.views[0].image + 0.1).clamp(0, 1))
+    changed = replace(inputs, views=(brighter, *inputs.views[1:]))
+    method = replace(METHODS[name], iterations=12)
+    first, second = (method.fitted(each).parameters for each in (inputs, changed))
+    assert len(first) != len(second) or not first.means.equal(second.means)
+
+
+def _one_view(inputs: SceneInputs) -> SceneInputs:
+    return replace(inputs, views=inputs.views[:1])
+
+
+def _nan_in_a_pose(inputs: SceneInputs) -> SceneInputs:
+    view = inputs.views[1]
+    world_to_cam = view.camera.world_to_cam.clone()
+    world_to_cam[0, 3] = math.nan
+    broken = replace(view, camera=replace(view.camera, world_to_cam=world_to_cam), name="b.png")
+    return replace(inputs, views=(inputs.views[0], broken))
+
+
+@each_method
+@pytest.mark.parametrize(
+    ("spoil", "said"), [(_one_view, "at least two"), (_nan_in_a_pose, "b.png: .* not finite")]
+)
+def test_views_that_cannot_be_used_are_named(name: str, spoil, said: str) -> None:
+    inputs, _ = scene_inputs(size=16)
+    with pytest.raises(InputError, match=said):
+        METHODS[name].synthesize(spoil(inputs))
+
+
+@dataclass(frozen=True)
+class _FlatDepth(DatasetDepth):
+    """A depth source that answers with one value everywhere."""
+
+    value: float
+
+    def depth_maps(self, views) -> list[DepthMap]:
+        flat = [torch.full_like(view.image[0], self.value) for view in views]
+        return [DepthMap(depth, torch.ones_like(depth)) for depth in flat]
+
+
+@pytest.mark.parametrize(
+    ("value", "said"), [(0.0, "no initial points"), (math.inf, "initial point is not finite")]
+)
+@pytest.mark.parametrize("method", [InstantSplat(**SMALL), ThreeDgs(**SMALL, init="dense")])
+def test_depth_without_points_or_with_infinite_ones_is_refused(method, value, said) -> None:
+    inputs, _ = scene_inputs(size=16)
+    with pytest.raises(InputError, match=said):
+        method.synthesize(replace(inputs, depth_source=_FlatDepth(value)))
+
+
+def test_no_triangulated_point_and_no_random_one_is_refused() -> None:
+    inputs, _ = scene_inputs(inputs_deg=(0.0, 170.0), size=16)
+    with pytest.raises(InputError, match=r"no initial points.*init=random"):
+        ThreeDgs(init_points=0).synthesize(inputs)
+
+
+def test_an_unknown_init_is_named() -> None:
+    inputs, _ = scene_inputs(size=16)
+    with pytest.raises(InputError, match="init=mvs is unknown"):
+        ThreeDgs(init="mvs").synthesize(inputs)
+
+
+def test_an_optimisation_that_diverges_is_stopped_with_its_iteration() -> None:
+    inputs, _ = scene_inputs(size=16)
+    wild = ThreeDgs(**SMALL, log_scales_rate=1e5, means_rate=1e30, means_rate_final=1e30)
+    with pytest.raises(Diverged, match=r"in iteration .* of 60; lower the learning rates"):
+        wild.synthesize(inputs)
+
+
+def test_growth_stops_at_the_limit_and_says_so() -> None:
+    inputs, _ = scene_inputs(size=24)
+    eager = replace(ThreeDgs(**SMALL), densify_from=0, max_gaussians=210, densify_gradient=0.0)
+    made = eager.synthesize(inputs)
+    assert made.counts["gaussians"] <= 210
+    assert made.given["growth"] == "stopped at 210 Gaussians"
+
+
+def test_growth_adds_gaussians_where_it_may() -> None:
+    inputs, _ = scene_inputs(size=24)
+    eager = replace(ThreeDgs(**SMALL), densify_from=0, max_gaussians=2000, densify_gradient=1e-6)
+    assert eager.synthesize(inputs).counts["gaussians"] > 250
+
+
+def test_given_points_are_where_training_starts() -> None:
+    inputs, _ = scene_inputs(size=16)
+    options = GaussianOptions(iterations=1, sh_degree=0)
+    recipe = Recipe(options, training_scene(inputs.views, inputs.depth_source, 0))
+    points = recipe.initial_points()
+    started = fit(Recipe(options, recipe.scene), points[torch.arange(50)])
+    assert (started.parameters.means - points.positions[:50]).abs().max() < 0.01
+    assert started.gaussians().means.shape == (50, 3)
+
+
+def test_the_world_comes_back_in_the_units_it_was_given_in() -> None:
+    """The dense start lies where the inputs' depth does, in their world."""
+    inputs, _ = scene_inputs(size=16)
+    method = InstantSplat(iterations=1, confidence_rates=False)
+    start = replace(method, full_iterations=1).fitted(inputs).gaussians()
+    surface = [unproject_to_world(view.depth, view.camera).flatten(0, 1) for view in inputs.views]
+    exact = "donot_use_mm_for_euclid_dist"
+    distance = torch.cdist(start.means, torch.cat(surface), compute_mode=exact).amin(1)
+    assert (distance < 2e-3).all()
+    assert len(start) > 256
