@@ -4,6 +4,17 @@ Light on purpose (no torch), so that `--help` is instant. YAMLs under `conf/` ch
 variants of a group; this package says what may stand in them.
 """
 
+from extrap_train.config.benchmark import (
+    CAPTURE_SOURCES,
+    DRAWS,
+    LPIPS_NETS,
+    CapturesConfig,
+    MethodConfig,
+    QuickConfig,
+    RulesConfig,
+    ScoringConfig,
+    TableConfig,
+)
 from extrap_train.config.checks import required_file, validate
 from extrap_train.config.commands import DataPrepConfig, TrainConfig
 from extrap_train.config.data import (
@@ -29,9 +40,14 @@ from extrap_train.config.training import TrainerConfig, ValidationConfig
 from extrap_train.config.tree import MISSING, dotted
 
 __all__ = [
+    "CAPTURE_SOURCES",
     "CATEGORIES",
+    "DRAWS",
     "FAMILIES",
+    "LPIPS_NETS",
     "MISSING",
+    "NORM_GROUPS",
+    "CapturesConfig",
     "CategoryConfig",
     "ClipConfig",
     "Co3dConfig",
@@ -44,12 +60,17 @@ __all__ = [
     "LocalConfig",
     "Mast3rConfig",
     "MatcherConfig",
+    "MethodConfig",
     "ModelConfig",
     "PrepConfig",
+    "QuickConfig",
+    "RulesConfig",
     "SamplerConfig",
+    "ScoringConfig",
     "SlurmConfig",
     "StereoConfig",
     "SyntheticConfig",
+    "TableConfig",
     "TrainConfig",
     "TrainerConfig",
     "UNetConfig",

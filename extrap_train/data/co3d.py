@@ -33,8 +33,8 @@ from extrap_train.data.images import (
     read_sixteen_bit,
 )
 from extrap_train.data.sequences import Frame, Sequence
-from extrap_train.data.validation import did_you_mean, require_dict
-from extrap_train.errors import InputError
+from extrap_train.data.validation import require_dict
+from extrap_train.errors import InputError, did_you_mean
 from extrap_train.views import Camera, View
 
 FRAME_ANNOTATIONS = "frame_annotations.jgz"

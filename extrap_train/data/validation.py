@@ -1,6 +1,5 @@
 """Checks that every reader shares."""
 
-import difflib
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -50,12 +49,6 @@ def require_dict(content: Any, what: str, file: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise InputError(f"{file}: expected {what}, found {_kind(content)}; check the file")
     return content
-
-
-def did_you_mean(name: str, known: Collection[str]) -> str:
-    """`did you mean a, b?` with the names that look like `name`, or the first few known ones."""
-    near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
-    return f"did you mean {', '.join(near)}?" if near else f"known: {', '.join(sorted(known)[:8])}"
 
 
 def _kind(content: Any) -> str:

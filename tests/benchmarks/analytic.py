@@ -1,16 +1,33 @@
 """A scene with exact answers as a method receives it, and the truth that it does not receive."""
 
+from dataclasses import dataclass, replace
+
 import torch
 
 from benchmarks.methods.base import SceneInputs
+from extrap_train.data.sequences import Frame, Sequence
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.views import View, stack_cameras
-from tests.scenes import SPHERE_ON_PLANE, Scene, orbit_camera
+from tests.scenes import Hit, Scene, orbit_camera, sphere
 
 
-def view_at(azimuth_deg: float, size: int, scene: Scene = SPHERE_ON_PLANE) -> View:
+def _from_inside(radius: float) -> Hit:
+    """A ball's inner surface."""
+
+    def hit(origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
+        a, b = directions.square().sum(1), (origins * directions).sum(1)
+        return (-b + (b.square() - a * (origins.square().sum(1) - radius**2)).sqrt()) / a
+
+    return hit
+
+
+BALL = Scene((sphere(0.6), _from_inside(4.0)))
+"""A ball in a round room: seen from all around."""
+
+
+def view_at(azimuth_deg: float, size: int) -> View:
     camera = orbit_camera(azimuth_deg, size=size)
-    return View(scene.image(camera), camera, scene.depth(camera), name=f"{azimuth_deg:g}")
+    return View(BALL.image(camera), camera, BALL.depth(camera), name=f"{azimuth_deg:g}")
 
 
 def scene_inputs(
@@ -28,3 +45,20 @@ def scene_inputs(
         seed=0,
     )
     return inputs, torch.stack([view.image for view in targets])
+
+
+def analytic_capture(count: int = 12, size: int = 32, name: str = "one") -> Sequence:
+    """A full turn around the ball on its plane."""
+    frames = []
+    for index in range(count):
+        view = replace(view_at(360 * index / count, size), name=f"{index:03d}.png")
+        frames.append(Frame(view.name, view.camera, True, False, _Photograph(view)))
+    return Sequence("apple", name, tuple(frames))
+
+
+@dataclass(frozen=True)
+class _Photograph:
+    view: View
+
+    def __call__(self) -> View:
+        return self.view

@@ -1,0 +1,164 @@
+"""Which frames are inputs and which are targets: drawn once, written down, hashed (METHOD §7).
+
+Farthest-point sampling picks a pool of nine frames; 3 or 6 of them are inputs, the rest targets.
+"""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from extrap_train.config import RulesConfig
+from extrap_train.data.files import read_json, write_whole
+from extrap_train.errors import InputError
+from extrap_train.geometry.viewpoints import (
+    camera_centers,
+    farthest_point_sample,
+    pairwise_angles,
+    scene_center,
+)
+from extrap_train.views import Camera
+
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One task: a capture's inputs and targets, by frame name."""
+
+    category: str
+    sequence: str
+    n_views: int
+    draw: str
+    seed: int
+    inputs: tuple[str, ...]
+    targets: tuple[str, ...]
+
+    @property
+    def label(self) -> str:
+        """Readable and unique within a protocol."""
+        return f"{self.category}-{self.sequence}-{self.n_views}-{self.draw}-{self.seed}"
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """The rules of a table and every draw made by them."""
+
+    rules: RulesConfig
+    draws: tuple[Draw, ...]
+
+    @property
+    def sha256(self) -> str:
+        """Of the whole content: every result carries it."""
+        return digest(self._content())
+
+    def _content(self) -> dict[str, Any]:
+        rules, draws = asdict(self.rules), [asdict(draw) for draw in self.draws]
+        return {"format": FORMAT, "rules": rules, "draws": draws}
+
+    def write(self, file: Path) -> None:
+        """Freeze into a file, a draw a line."""
+        content = self._content()
+        draws = ",\n  ".join(json.dumps(draw) for draw in content.pop("draws"))
+        head = json.dumps({**content, "sha256": self.sha256})
+        write_whole(file, f'{head[:-1]},\n "draws": [\n  {draws}\n ]}}\n'.encode())
+
+    @classmethod
+    def read(cls, file: Path) -> "Protocol":
+        """A frozen protocol; raises InputError where its content is not what its hash says."""
+        content = read_json(file)
+        try:
+            rules = RulesConfig(**content["rules"])
+            draws = tuple(draw_of(entry) for entry in content["draws"])
+            stated = content["sha256"]
+        except (TypeError, KeyError, ValueError) as error:
+            raise InputError(f"{file}: is no protocol ({error!r}); delete it") from None
+        protocol = cls(rules, draws)
+        if content.get("format") != FORMAT or protocol.sha256 != stated:
+            raise InputError(
+                f"{file}: its content is not what its hash {stated[:12]} says; restore the file, "
+                "or delete it with the results beside it"
+            )
+        return protocol
+
+
+def digest(content: Any) -> str:
+    """SHA-256 of a JSON value, whatever the order of its keys."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def draw_sequence(
+    category: str, sequence: str, names: Sequence[str], cameras: Camera, rules: RulesConfig
+) -> list[Draw]:
+    """Every draw of one capture: kinds × seeds × numbers of views.
+
+    The draws of one kind and seed are nested, so that what six views add to three is theirs. Raises
+    InputError where there are fewer frames than the pool takes.
+    """
+    if len(names) < rules.pool:
+        raise InputError(
+            f"{category}/{sequence}: has {len(names)} usable frames, and the protocol picks "
+            f"{rules.pool}; leave it out, or give a smaller rules.pool="
+        )
+    pool = farthest_frames(cameras, rules.pool)
+    angles = pairwise_angles(cameras, scene_center(cameras))[np.ix_(pool, pool)]
+    draws = []
+    for kind in rules.draws:
+        for seed in rules.seeds:
+            order = _ORDERS[kind](angles, _generator(seed, category, sequence))
+            for n_views in rules.views:
+                chosen = set(order[:n_views])
+                inputs = tuple(names[pool[i]] for i in range(len(pool)) if i in chosen)
+                targets = tuple(names[pool[i]] for i in range(len(pool)) if i not in chosen)
+                draws.append(Draw(category, sequence, n_views, kind, seed, inputs, targets))
+    return draws
+
+
+def farthest_frames(cameras: Camera, count: int) -> list[int]:
+    """Farthest-point sampling on the camera positions, from the one nearest to their mean on; in
+    the capture's order.
+    """
+    positions = camera_centers(cameras)
+    start = int(np.linalg.norm(positions - positions.mean(0), axis=1).argmin())
+    return sorted(farthest_point_sample(positions, count, start).tolist())
+
+
+def _generator(seed: int, category: str, sequence: str) -> np.random.Generator:
+    """The capture's own, whatever other captures there are."""
+    name = hashlib.sha256(f"{seed}/{category}/{sequence}".encode()).digest()
+    return np.random.default_rng(int.from_bytes(name[:8], "big"))
+
+
+def _random(angles: Float[np.ndarray, "n n"], rng: np.random.Generator) -> list[int]:
+    """As in the paper: well spread, clustered on one side, or between."""
+    return [int(i) for i in rng.permutation(len(angles))]
+
+
+def _spread(angles: Float[np.ndarray, "n n"], rng: np.random.Generator) -> list[int]:
+    """Each the farthest in angle from those before it."""
+    chosen = [int(rng.integers(len(angles)))]
+    while len(chosen) < len(angles):
+        apart = angles[:, chosen].min(1)
+        apart[chosen] = -1
+        chosen.append(int(apart.argmax()))
+    return chosen
+
+
+def _one_sided(angles: Float[np.ndarray, "n n"], rng: np.random.Generator) -> list[int]:
+    """The nearest in angle to one of them."""
+    center = int(rng.integers(len(angles)))
+    return [int(i) for i in np.argsort(angles[center], kind="stable")]
+
+
+_ORDERS = {"random": _random, "spread": _spread, "one_sided": _one_sided}
+
+
+def draw_of(entry: dict[str, Any]) -> Draw:
+    """A draw from its JSON."""
+    lists = {name: tuple(entry[name]) for name in ("inputs", "targets")}
+    return Draw(**{**entry, **lists})

@@ -1,0 +1,99 @@
+"""A prepared draw gives a method its inputs and nothing else, and notices changed files."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.protocol import Draw, draw_sequence
+from benchmarks.scenes import Scene, prepare_scene
+from extrap_train.config import RulesConfig
+from extrap_train.errors import InputError
+from extrap_train.metrics import psnr
+from tests.benchmarks.analytic import analytic_capture
+
+_RULES = RulesConfig(image_size=32, pool=9)
+
+
+@pytest.fixture(scope="module")
+def draw_and_scene(tmp_path_factory: pytest.TempPathFactory) -> tuple[Draw, Scene]:
+    capture = analytic_capture()
+    draw = draw_sequence("apple", "one", *_frames(capture), _RULES)[0]
+    folder = tmp_path_factory.mktemp("scenes") / draw.label
+    return draw, prepare_scene(folder, capture, draw, _RULES, "origin")
+
+
+def _frames(capture):
+    from extrap_train.views import stack_poses
+
+    return [f.name for f in capture.frames], stack_poses([f.camera for f in capture.frames])
+
+
+def test_inputs_are_the_photographs_with_depth(draw_and_scene: tuple[Draw, Scene]) -> None:
+    draw, scene = draw_and_scene
+    inputs = scene.inputs()
+    frames = {frame.name: frame.load() for frame in analytic_capture().frames}
+    assert [view.name for view in inputs.views] == list(draw.inputs)
+    for view in inputs.views:
+        true = frames[view.name]
+        torch.testing.assert_close(view.image, true.image, atol=0.5 / 255 + 1e-6, rtol=0)
+        torch.testing.assert_close(view.depth, true.depth)
+        torch.testing.assert_close(view.camera.world_to_cam, true.camera.world_to_cam)
+    assert inputs.targets.world_to_cam.shape == (6, 4, 4)
+
+
+def test_a_method_needs_no_file_of_the_truth(
+    draw_and_scene: tuple[Draw, Scene], tmp_path: Path
+) -> None:
+    """Without truth, warps and masks on the disk, the inputs are still complete."""
+    import shutil
+
+    _, scene = draw_and_scene
+    bare = tmp_path / "bare"
+    shutil.copytree(scene.folder, bare, ignore=shutil.ignore_patterns("truth", "warps", "masks"))
+    inputs = Scene.open(bare).inputs()
+    known = {name for view in inputs.views for name in [view.name]}
+    assert not known & set(scene.draw.targets)
+
+
+def test_the_mask_is_what_the_inputs_show(draw_and_scene: tuple[Draw, Scene]) -> None:
+    truth = draw_and_scene[1].truth()
+    share = truth.masks.mean((1, 2))
+    assert share.max() > 0.3
+    assert share.max() < 1
+    near = torch.tensor(draw_and_scene[1].angles_rad) < 1
+    assert (psnr(truth.warps, truth.images, truth.masks)[near] > 22).all()
+    assert not (truth.warps * (1 - truth.masks)[:, None]).any()
+
+
+def test_what_is_there_is_used_and_what_was_touched_made_anew(
+    draw_and_scene: tuple[Draw, Scene],
+) -> None:
+    draw, scene = draw_and_scene
+    capture, folder = analytic_capture(), scene.folder
+    before = (folder / "scene.json").stat().st_ino
+    assert prepare_scene(folder, capture, draw, _RULES, "origin").data_hash == scene.data_hash
+    assert (folder / "scene.json").stat().st_ino == before
+    np.save(folder / "inputs" / "depth.npy", np.zeros((3, 32, 32), np.float32))
+    assert scene.changed_files() == ["inputs/depth.npy"]
+    again = prepare_scene(folder, capture, draw, _RULES, "origin")
+    assert again.data_hash == scene.data_hash
+    assert not again.changed_files()
+    assert prepare_scene(folder, capture, draw, _RULES, "other").record["origin"] == "other"
+
+
+def test_a_frame_that_the_capture_lacks_is_named(tmp_path: Path) -> None:
+    draw = Draw("apple", "one", 1, "random", 0, ("nowhere.png",), ("000.png",))
+    with pytest.raises(InputError, match=r"has no frame nowhere\.png"):
+        prepare_scene(tmp_path / "scene", analytic_capture(), draw, _RULES, "")
+    assert not list(tmp_path.iterdir())
+
+
+def test_estimated_depth_is_charged_to_the_method_that_asks() -> None:
+    from benchmarks.recorded_depth import RecordedDepth
+
+    source = RecordedDepth(7.5)
+    assert source.seconds == 0
+    source.depth_maps([frame.load() for frame in analytic_capture().frames[:2]])
+    assert source.seconds == 7.5
