@@ -1,13 +1,17 @@
 """The test captures of a table, whatever they come from."""
 
-import os
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from benchmarks.files import read_points
 from benchmarks.protocol import Draw, Protocol, draw_sequence
 from data_prep.filter import judge_all
 from data_prep.split import split_sequences
-from data_prep.synthesize import sequence_name, synthesize
 from extrap_train.config import CapturesConfig, PrepConfig, RulesConfig, SyntheticConfig
 from extrap_train.data.co3d import read_category
 from extrap_train.data.files import read_json
@@ -15,55 +19,76 @@ from extrap_train.data.photographs import CATEGORY as NO_CATEGORY
 from extrap_train.data.posed import TRANSFORMS, read_transforms
 from extrap_train.data.scene import open_scene
 from extrap_train.data.sequences import Sequence
+from extrap_train.data.synthetic import build_scene, surface_points
+from extrap_train.data.synthetic.capture import synthetic_sequence
 from extrap_train.data.validation import require_list
 from extrap_train.errors import InputError
 from extrap_train.views import stack_poses
 
+CLOUD_POINTS = 20_000
+"""Of the true surface of a rendered scene."""
 
-def open_captures(config: CapturesConfig, categories: list[str], folder: Path) -> list[Sequence]:
-    """The test captures of some categories; rendered ones are made under `folder` if missing."""
+
+@dataclass(frozen=True)
+class Capture:
+    """A test capture, and its true surface where that is known."""
+
+    sequence: Sequence
+    cloud: Callable[[], Float[Tensor, "m 3"]] | None = None
+
+
+def open_captures(config: CapturesConfig, categories: list[str]) -> list[Capture]:
+    """The test captures of some categories; nothing is rendered or decoded yet."""
     match config.source:
         case "synthetic":
-            return [s for c in categories for s in _synthetic(config, c, folder)]
+            return [
+                _synthetic(config, category, index)
+                for category in categories
+                for index in range(config.sequences)
+            ]
         case "co3d":
-            return [s for c in categories for s in _co3d(config, c)]
+            return [_with_cloud(s) for category in categories for s in _co3d(config, category)]
         case "reconfusion":
-            return _reconfusion(config)
+            return [_with_cloud(s) for s in _reconfusion(config)]
         case _:
-            return [_named(spec, categories) for spec in config.scenes]
+            return [_with_cloud(_named(spec, categories)) for spec in config.scenes]
 
 
-def freeze(config: CapturesConfig, rules: RulesConfig, captures: list[Sequence]) -> Protocol:
+def freeze(config: CapturesConfig, rules: RulesConfig, captures: list[Capture]) -> Protocol:
     """Draw inputs and targets for every capture."""
+    sequences = [capture.sequence for capture in captures]
     if config.source == "reconfusion":
-        draws = [d for capture in captures for d in _given_draws(config, capture, rules)]
+        draws = [draw for one in sequences for draw in _given_draws(config, one, rules)]
     else:
         draws = [
             draw
-            for capture in captures
+            for one in sequences
             for draw in draw_sequence(
-                capture.category,
-                capture.name,
-                [frame.name for frame in capture.frames],
-                stack_poses([frame.camera for frame in capture.frames]),
+                one.category,
+                one.name,
+                [frame.name for frame in one.frames],
+                stack_poses([frame.camera for frame in one.frames]),
                 rules,
             )
         ]
     return Protocol(rules, tuple(draws))
 
 
-def _synthetic(config: CapturesConfig, category: str, folder: Path) -> list[Sequence]:
-    options = SyntheticConfig(
-        test_sequences=config.sequences,
-        train_sequences=0,
-        frames=config.frames,
-        image_size=config.render_size,
-        seed=config.seed,
-    )
-    root = Path(config.root) if config.root else folder
-    synthesize(options, category, root, len(os.sched_getaffinity(0)))
-    wanted = {sequence_name(index) for index in range(config.sequences)}
-    return [s for s in read_category(root, category) if s.name in wanted]
+def _synthetic(config: CapturesConfig, category: str, index: int) -> Capture:
+    options = SyntheticConfig(frames=config.frames, image_size=config.render_size, seed=config.seed)
+
+    def cloud() -> Float[Tensor, "m 3"]:
+        scene = build_scene(category, index, config.seed)
+        return torch.from_numpy(surface_points(scene, CLOUD_POINTS).points).float()
+
+    return Capture(synthetic_sequence(category, index, options), cloud)
+
+
+def _with_cloud(sequence: Sequence) -> Capture:
+    cloud = sequence.point_cloud
+    if cloud is None or not cloud.is_file():
+        return Capture(sequence)
+    return Capture(sequence, lambda: read_points(cloud))
 
 
 def _co3d(config: CapturesConfig, category: str) -> list[Sequence]:

@@ -22,15 +22,16 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from benchmarks.files import json_bytes, read_points
+from benchmarks.captures import Capture
+from benchmarks.files import json_bytes
 from benchmarks.methods.base import SceneInputs, Stopwatch
-from benchmarks.methods.references import warped_batch
 from benchmarks.protocol import Draw, digest, draw_of
 from benchmarks.recorded_depth import RecordedDepth
 from extrap_train.config import DatasetDepthConfig, DepthConfig, RulesConfig, StereoConfig
 from extrap_train.data.files import read_json, write_whole
 from extrap_train.data.images import read_image, to_eight_bits
-from extrap_train.data.sequences import Sequence
+from extrap_train.data.module import with_warp
+from extrap_train.data.queries import query_batch
 from extrap_train.depth.build import depth_source
 from extrap_train.errors import InputError
 from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
@@ -143,7 +144,7 @@ class Scene:
 
 
 def prepare_scene(
-    folder: Path, capture: Sequence, draw: Draw, rules: RulesConfig, origin: str
+    folder: Path, capture: Capture, draw: Draw, rules: RulesConfig, origin: str
 ) -> Scene:
     """Read a draw's frames and write its folder, or open the one that is there.
 
@@ -166,9 +167,9 @@ def prepare_scene(
     return Scene.open(folder)
 
 
-def _write_scene(folder: Path, capture: Sequence, draw: Draw, rules: RulesConfig) -> dict[str, Any]:
+def _write_scene(folder: Path, capture: Capture, draw: Draw, rules: RulesConfig) -> dict[str, Any]:
     size = rules.image_size
-    frames = {frame.name: frame for frame in capture.frames}
+    frames = {frame.name: frame for frame in capture.sequence.frames}
     missing = [name for name in (*draw.inputs, *draw.targets) if name not in frames]
     if missing:
         raise InputError(
@@ -178,9 +179,8 @@ def _write_scene(folder: Path, capture: Sequence, draw: Draw, rules: RulesConfig
     inputs, seconds = _with_depth(photographs, rules)
     targets = [frames[name].load().squared(size) for name in draw.targets]
     cameras = stack_cameras([view.camera for view in targets])
-    told = SceneInputs(draw.category, tuple(inputs), cameras, RecordedDepth(seconds), draw.seed)
     depths = [view.depth for view in inputs if view.depth is not None]
-    warp = warped_batch(told, depths, len(inputs)).warp
+    warp = with_warp(query_batch(inputs, cameras, len(inputs), size)[0]).warp
     assert warp is not None
     pictures = {
         "inputs": torch.stack([view.image for view in inputs]),
@@ -197,8 +197,8 @@ def _write_scene(folder: Path, capture: Sequence, draw: Draw, rules: RulesConfig
     known = [view.depth for view in targets if view.depth is not None]
     if len(known) == len(targets):
         contents["truth/depth.npy"] = _npy_bytes(torch.stack(known))
-    if capture.point_cloud is not None and capture.point_cloud.is_file():
-        contents["truth/cloud.npy"] = _npy_bytes(read_points(capture.point_cloud))
+    if capture.cloud is not None:
+        contents["truth/cloud.npy"] = _npy_bytes(capture.cloud())
     for name, content in contents.items():
         write_whole(folder / name, content)
     return {

@@ -7,7 +7,9 @@ from pathlib import Path
 import torch
 
 from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis
-from benchmarks.methods.references import input_depths, nearest_inputs, warped_batch
+from benchmarks.methods.references import nearest_inputs, views_with_depth
+from extrap_train.data.module import with_warp
+from extrap_train.data.queries import query_batch
 from extrap_train.diffusion.baselines import inpainted_warp
 
 
@@ -41,7 +43,8 @@ class InpaintedWarp:
     def synthesize(self, inputs: SceneInputs) -> Synthesis:
         """Warp and inpaint every target."""
         with Stopwatch() as watch:
-            batch = warped_batch(inputs, input_depths(inputs), self.references)
+            views, size = views_with_depth(inputs), inputs.targets.height
+            batch = with_warp(query_batch(views, inputs.targets, self.references, size)[0])
             assert batch.warp is not None
             images = inpainted_warp(batch.warp).clamp(0, 1)
         return Synthesis(images, watch.seconds / len(images))

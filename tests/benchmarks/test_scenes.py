@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.captures import Capture
 from benchmarks.protocol import Draw, draw_sequence
 from benchmarks.scenes import Scene, prepare_scene
 from extrap_train.config import RulesConfig
@@ -18,8 +19,8 @@ _RULES = RulesConfig(image_size=32, pool=9)
 
 @pytest.fixture(scope="module")
 def draw_and_scene(tmp_path_factory: pytest.TempPathFactory) -> tuple[Draw, Scene]:
-    capture = analytic_capture()
-    draw = draw_sequence("apple", "one", *_frames(capture), _RULES)[0]
+    capture = Capture(analytic_capture())
+    draw = draw_sequence("apple", "one", *_frames(capture.sequence), _RULES)[0]
     folder = tmp_path_factory.mktemp("scenes") / draw.label
     return draw, prepare_scene(folder, capture, draw, _RULES, "origin")
 
@@ -71,7 +72,7 @@ def test_what_is_there_is_used_and_what_was_touched_made_anew(
     draw_and_scene: tuple[Draw, Scene],
 ) -> None:
     draw, scene = draw_and_scene
-    capture, folder = analytic_capture(), scene.folder
+    capture, folder = Capture(analytic_capture()), scene.folder
     before = (folder / "scene.json").stat().st_ino
     assert prepare_scene(folder, capture, draw, _RULES, "origin").data_hash == scene.data_hash
     assert (folder / "scene.json").stat().st_ino == before
@@ -86,7 +87,7 @@ def test_what_is_there_is_used_and_what_was_touched_made_anew(
 def test_a_frame_that_the_capture_lacks_is_named(tmp_path: Path) -> None:
     draw = Draw("apple", "one", 1, "random", 0, ("nowhere.png",), ("000.png",))
     with pytest.raises(InputError, match=r"has no frame nowhere\.png"):
-        prepare_scene(tmp_path / "scene", analytic_capture(), draw, _RULES, "")
+        prepare_scene(tmp_path / "scene", Capture(analytic_capture()), draw, _RULES, "")
     assert not list(tmp_path.iterdir())
 
 
