@@ -30,7 +30,11 @@ _GROUPS: dict[str, list[type]] = {
     "category": [schema.CategoryConfig],
     "data": [schema.SyntheticConfig, schema.Co3dConfig],
     "depth": [schema.DatasetDepthConfig, schema.StereoConfig, schema.Mast3rConfig],
-    "matcher": [schema.FlowMatcherConfig],
+    "matcher": [
+        schema.FlowMatcherConfig,
+        schema.LoftrMatcherConfig,
+        schema.AlikedMatcherConfig,
+    ],
     "launcher": [schema.LocalConfig, schema.SlurmConfig],
     "model": [schema.ModelConfig],
 }

@@ -27,7 +27,12 @@ from extrap_train.config.data import (
 )
 from extrap_train.config.depth import DatasetDepthConfig, DepthConfig, Mast3rConfig, StereoConfig
 from extrap_train.config.launcher import LauncherConfig, LocalConfig, SlurmConfig
-from extrap_train.config.matching import FlowMatcherConfig, MatcherConfig
+from extrap_train.config.matching import (
+    AlikedMatcherConfig,
+    FlowMatcherConfig,
+    LoftrMatcherConfig,
+    MatcherConfig,
+)
 from extrap_train.config.model import (
     FAMILIES,
     ClipConfig,
@@ -47,6 +52,7 @@ __all__ = [
     "LPIPS_NETS",
     "MISSING",
     "NORM_GROUPS",
+    "AlikedMatcherConfig",
     "CapturesConfig",
     "CategoryConfig",
     "ClipConfig",
@@ -58,6 +64,7 @@ __all__ = [
     "FlowMatcherConfig",
     "LauncherConfig",
     "LocalConfig",
+    "LoftrMatcherConfig",
     "Mast3rConfig",
     "MatcherConfig",
     "MethodConfig",

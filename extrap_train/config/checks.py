@@ -25,6 +25,7 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "depth.neighbours": (1, 64),
     "depth.image_size": (16, 8192),
     "matcher.image_size": (16, 8192),
+    "matcher.keypoints": (2, 20_000),
     "launcher.tasks": (1, 1_000_000),
     "launcher.at_once": (1, 1_000_000),
     "launcher.cpus": (1, 1024),

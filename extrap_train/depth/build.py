@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-import torch
-
 from extrap_train.config import (
     DatasetDepthConfig,
     DepthConfig,
@@ -16,6 +14,7 @@ from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.depth.mast3r.checkpoint import read_network
 from extrap_train.depth.mast3r.source import Mast3rDepth
 from extrap_train.depth.stereo import PlaneSweepStereo
+from extrap_train.device import fastest_device
 from extrap_train.errors import InputError
 
 
@@ -31,10 +30,6 @@ def depth_source(config: DepthConfig) -> DepthSource:
             return PlaneSweepStereo(config)
         case Mast3rConfig():
             path = required_file(config.checkpoint, "depth.checkpoint", config.weights)
-            return Mast3rDepth(config, read_network(Path(path)).to(_device()))
+            return Mast3rDepth(config, read_network(Path(path)).to(fastest_device()))
         case _:
             raise InputError(f"depth={config.name}: unknown; choose dataset, stereo or mast3r")
-
-
-def _device() -> torch.device:
-    return torch.device("cuda" if torch.cuda.is_available() else "cpu")

@@ -1,15 +1,39 @@
 """A matcher from its options."""
 
-from extrap_train.config import FlowMatcherConfig, MatcherConfig
+from pathlib import Path
+
+from extrap_train.config import (
+    AlikedMatcherConfig,
+    FlowMatcherConfig,
+    LoftrMatcherConfig,
+    MatcherConfig,
+    required_file,
+)
+from extrap_train.device import fastest_device
 from extrap_train.errors import InputError
 from extrap_train.matching import Matcher
+from extrap_train.matching.aliked import AlikedMatcher, read_aliked
 from extrap_train.matching.flow import FlowMatcher
+from extrap_train.matching.loftr import LoftrMatcher, read_loftr
 
 
-def matcher(config: MatcherConfig) -> Matcher:
-    """The matcher that the type of `config` stands for."""
+def matcher(config: MatcherConfig, option: str = "matcher") -> Matcher:
+    """The matcher that the type of `config`, given as `option`, stands for.
+
+    A network runs on the GPU where there is one. InputError where its weights cannot be used.
+    """
     match config:
         case FlowMatcherConfig():
             return FlowMatcher(config)
+        case LoftrMatcherConfig():
+            loftr = read_loftr(_weights(config, option), config, f"{option}.checkpoint")
+            return LoftrMatcher(config, loftr.to(fastest_device()))
+        case AlikedMatcherConfig():
+            aliked = read_aliked(_weights(config, option), config, f"{option}.checkpoint")
+            return AlikedMatcher(config, aliked.to(fastest_device()))
         case _:
-            raise InputError(f"matcher={config.name}: unknown; choose flow")
+            raise InputError(f"{option}={config.name}: unknown; choose flow, loftr or aliked")
+
+
+def _weights(config: LoftrMatcherConfig | AlikedMatcherConfig, option: str) -> Path:
+    return Path(required_file(config.checkpoint, f"{option}.checkpoint", config.weights))

@@ -16,6 +16,7 @@ from extrap_train.geometry.cameras import pixel_grid
 from extrap_train.geometry.fill import fill_holes
 from extrap_train.matching import DenseFlow, Matches
 from extrap_train.matching.likeness import windowed_correlation
+from extrap_train.matching.pictures import grey, resized
 
 LARGEST_ENLARGEMENT = 2.0
 """Enlarged twice, small pictures are matched to about a tenth of a pixel; more brings nothing."""
@@ -23,8 +24,6 @@ LARGEST_ERROR = 2.0
 """Forward-backward error, in pixels, from which both directions contradict each other."""
 LEAST_SIDE = 16
 """Smaller pictures have no room for the search's patches, and are padded."""
-LUMA = (0.299, 0.587, 0.114)
-"""Weights of the colours in a grey picture (Rec. 601)."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +67,7 @@ class FlowMatcher:
         self, first: Float[Tensor, "h w"], second: Float[Tensor, "h2 w2"]
     ) -> tuple[Float[Tensor, "2 h w"], Float[Tensor, "2 h2 w2"]]:
         scale = min(LARGEST_ENLARGEMENT, self.config.image_size / max(*first.shape, *second.shape))
-        working = [_resized(picture[None], scale)[0] for picture in (first, second)]
+        working = [_scaled(picture, scale) for picture in (first, second)]
         size = tuple(
             max(LEAST_SIDE, *sides) for sides in zip(*(x.shape for x in working), strict=True)
         )
@@ -77,11 +76,6 @@ class FlowMatcher:
             _restored(_inverse_search(a, b), working[0].shape, first.shape),
             _restored(_inverse_search(b, a), working[1].shape, second.shape),
         )
-
-
-def grey(image: Float[Tensor, "3 h w"]) -> Float[Tensor, "h w"]:
-    """Brightness in [0, 1]."""
-    return torch.einsum("chw,c->hw", image, image.new_tensor(LUMA))
 
 
 def _inverse_search(
@@ -93,11 +87,9 @@ def _inverse_search(
     return torch.from_numpy(search.calc(first, second, start)).permute(2, 0, 1)
 
 
-def _resized(planes: Float[Tensor, "c h w"], scale: float) -> Float[Tensor, "c h2 w2"]:
-    size = [max(1, round(side * scale)) for side in planes.shape[-2:]]
-    return functional.interpolate(
-        planes[None], size, mode="bicubic", antialias=scale < 1, align_corners=False
-    )[0]
+def _scaled(picture: Float[Tensor, "h w"], scale: float) -> Float[Tensor, "h2 w2"]:
+    height, width = (max(1, round(side * scale)) for side in picture.shape)
+    return resized(picture[None], height, width)[0]
 
 
 def _padded(picture: Float[Tensor, "h w"], size: tuple[int, ...]) -> Float[Tensor, "h2 w2"]:

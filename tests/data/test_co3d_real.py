@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch
-from epipolar import epipolar_distances
+from two_views import epipolar_distances
 
 from extrap_train.data.co3d import read_category, read_sequence, read_set_list
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 from captures import view_at
-from epipolar import epipolar_distances
 from PIL import Image
+from two_views import epipolar_distances
 
 from extrap_train.data.colmap_model import read_model
 from extrap_train.errors import InputError

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 import torch
+from tests.depth.traced_scenes import SCENES, orbit_camera, render
 
 from benchmarks.methods.gaussians.sift import epipolar_distance, projection_matrices
 from benchmarks.methods.gaussians.triangulate import triangulate, triangulated_points
 from extrap_train.geometry.cameras import project
 from extrap_train.views import View
-from tests.depth.traced_scenes import SCENES, orbit_camera, render
 from tests.scenes import orbit_camera as analytic_camera
 
 

@@ -1,0 +1,68 @@
+"""Sparse matches: ALIKED's keypoints (Zhao et al., 2023) from kornia, by mutual descriptors."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float
+from kornia.feature import ALIKED, match_smnn
+from torch import Tensor
+
+from extrap_train.config import AlikedMatcherConfig
+from extrap_train.matching import Matches, known_at
+from extrap_train.matching.pictures import pixels_of, resized
+from extrap_train.weight_files import WeightFile
+
+LARGEST_RATIO = 0.9
+"""Of the distances to the nearest and the second nearest descriptor, in both directions."""
+CONSTANTS = ("dkd.hw_grid",)
+"""Of the detector: part of its state, but not of the published file."""
+
+
+@dataclass(frozen=True)
+class AlikedMatcher:
+    """Works across wide baselines where there is texture.
+
+    Confidence is 1 minus the ratio of the nearest descriptor's distance to the second one's.
+    """
+
+    config: AlikedMatcherConfig
+    network: ALIKED = field(repr=False, compare=False)
+
+    @torch.no_grad()
+    def match(
+        self,
+        first: Float[Tensor, "3 h w"],
+        second: Float[Tensor, "3 h2 w2"],
+        first_known: Bool[Tensor, "h w"] | None = None,
+    ) -> Matches:
+        """Matches that are unique in both pictures; on the device of `first`."""
+        points, descriptors = self._features(first)
+        others, other_descriptors = self._features(second)
+        ratios, pairs = match_smnn(descriptors, other_descriptors, LARGEST_RATIO)
+        matches = Matches(
+            points[pairs[:, 0]].to(first),
+            others[pairs[:, 1]].to(first),
+            (1 - ratios[:, 0]).to(first),
+        )
+        return matches if first_known is None else matches[known_at(first_known, matches.first)]
+
+    def _features(
+        self, image: Float[Tensor, "3 h w"]
+    ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n d"]]:
+        scale = min(1.0, self.config.image_size / max(image.shape[1:]))
+        height, width = (max(1, round(side * scale)) for side in image.shape[1:])
+        device = next(self.network.parameters()).device
+        working = resized(image.to(device), height, width)
+        (found,) = self.network(working[None])
+        return pixels_of(found.keypoints, working.shape, image.shape), found.descriptors
+
+
+def read_aliked(path: Path, config: AlikedMatcherConfig, option: str) -> ALIKED:
+    """The detector with a file's weights, in evaluation mode; InputError if they are another's."""
+    # Without a threshold the strongest keypoints are taken, however weak.
+    network = ALIKED(max_num_keypoints=config.keypoints, detection_threshold=0.0)
+    file = WeightFile(path, option, config.weights)
+    own = network.state_dict()
+    file.fill(network, {name: own[name] for name in CONSTANTS} | file.tensors(file.read()))
+    return network.eval().requires_grad_(False)
