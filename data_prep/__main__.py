@@ -22,7 +22,9 @@ def _run(config: DataPrepConfig) -> None:
             config.prep,
             output=Path(config.output),
             workers=config.workers or len(os.sched_getaffinity(0)),
+            matcher=config.matcher,
             launcher=config.launcher,
+            retry=True,
         )
         write_report(prepared, Console())
 

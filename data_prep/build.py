@@ -1,6 +1,5 @@
-"""Preparation of a category: filter, frames with depth, split, pairs, tables."""
+"""Preparation of a category: filter, split, every sequence as a unit of its own, tables."""
 
-import errno
 import hashlib
 import json
 import logging
@@ -8,28 +7,53 @@ import shutil
 from collections import Counter
 from collections.abc import Collection
 from collections.abc import Sequence as ListOf
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from tqdm import tqdm
 
-from data_prep.filter import Verdict, judge_all
-from data_prep.frames import frames_key, make_frames
-from data_prep.split import split_sequences
+from data_prep.filter import judge_all
+from data_prep.frames import frames_key
+from data_prep.split import Split, split_sequences
 from data_prep.tables import Outcome, write_results
+from data_prep.unit import NO_SPACE, Unit, Workshop, prepare_unit
 from extrap_train.config import PrepConfig
-from extrap_train.data.frame_files import frames_folder, read_camera_table, write_frames
 from extrap_train.data.sequences import Sequence
 from extrap_train.data.store import FORMAT, PreparedData, read_manifest
 from extrap_train.depth import DepthSource
 from extrap_train.errors import InputError
+from extrap_train.jobs import Died, Launcher
+from extrap_train.jobs.local import LocalLauncher
+from extrap_train.matching import Matcher
 
 LOG = logging.getLogger(__name__)
-
+HERE = LocalLauncher(1)
+"""Runs units one after the other in this process."""
 _BYTES_PER_PIXEL = 3 + 2 + 1
 """Of a stored frame: colours, depth, mask."""
-_NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What decides everything about a preparation but where it runs."""
+
+    sequences: ListOf[Sequence]
+    workshop: Workshop
+    test_names: Collection[str] | int
+
+    @property
+    def key(self) -> str:
+        """A hash of all of it."""
+        test = self.test_names if isinstance(self.test_names, int) else sorted(self.test_names)
+        shop = self.workshop
+        how = [asdict(shop.options), test, repr(shop.matcher)]
+        digest = hashlib.sha256(json.dumps([FORMAT, *how]).encode())
+        for sequence in self.sequences:
+            qualities = [sequence.viewpoint_quality, sequence.point_cloud_quality]
+            digest.update(json.dumps([sequence.category, sequence.name, qualities]).encode())
+            frames = frames_key(sequence, shop.depth_source, shop.options.image_size, False)
+            digest.update(frames.encode())
+        return digest.hexdigest()
 
 
 def prepare(
@@ -39,111 +63,86 @@ def prepare(
     *,
     test_names: Collection[str] | int,
     folder: Path,
-    workers: int = 1,
+    frames: Path | None = None,
+    matcher: Matcher | None = None,
+    launcher: Launcher = HERE,
     progress: bool = True,
+    retry: bool = True,
 ) -> PreparedData:
     """Make pair data from sequences, or open what an equal earlier call has made.
 
-    A sequence that cannot be used is dropped with its reason; finished sequences are kept if the
-    call is repeated. Raises InputError where no sequence is left, or the disk is full.
+    `frames` is the folder of the frames, which calls with other pair options may share; the same
+    as `folder` by default. Training warps are corrected where there is a `matcher`. A sequence that
+    cannot be used is dropped with its reason, and tried again by the next call unless `retry` is
+    False. Finished sequences are kept whatever ends the call. Raises InputError where no sequence
+    is left, or the disk is full.
     """
-    key = _preparation_key(sequences, depth_source, options, test_names)
-    if _is_finished(folder, key):
+    shop = Workshop(depth_source, options, matcher, frames or folder, folder)
+    plan = _Plan(sequences, shop, test_names)
+    key = plan.key
+    if _is_finished(folder, key, retry):
         LOG.info("%s is prepared already and used as it is", folder)
         return PreparedData.open(folder)
     try:
+        folder.mkdir(parents=True, exist_ok=True)
         (folder / "manifest.json").unlink(missing_ok=True)
-        outcomes = _make_all(sequences, depth_source, options, folder, workers, progress)
-        kept = [outcome for outcome in outcomes if outcome.cameras is not None]
-        if not kept:
-            raise InputError(_nothing_left(outcomes))
-        split = split_sequences([outcome.name for outcome in kept], test_names)
-        write_results(folder, outcomes, split, options, key)
+        outcomes, split = _make_all(plan, launcher, progress)
+        write_results(shop, outcomes, split, key)
     except OSError as error:
-        if error.errno not in _NO_SPACE:
+        if error.errno not in NO_SPACE:
             raise
         raise InputError(_disk_full(folder, sequences, options)) from None
     return PreparedData.open(folder)
 
 
-def _preparation_key(
-    sequences: ListOf[Sequence],
-    depth_source: DepthSource,
-    options: PrepConfig,
-    test_names: Collection[str] | int,
-) -> str:
-    test = test_names if isinstance(test_names, int) else sorted(test_names)
-    digest = hashlib.sha256(json.dumps([FORMAT, asdict(options), test]).encode())
-    for sequence in sequences:
-        qualities = [sequence.viewpoint_quality, sequence.point_cloud_quality]
-        digest.update(json.dumps([sequence.category, sequence.name, qualities]).encode())
-        digest.update(frames_key(sequence, depth_source, options.image_size, False).encode())
-    return digest.hexdigest()
+def _is_finished(folder: Path, key: str, retry: bool) -> bool:
+    if not (folder / "manifest.json").exists():
+        return False
+    manifest = read_manifest(folder)
+    failed = manifest["sequences"]["failed"]
+    if manifest.get("key") == key and failed and retry:
+        LOG.warning("%s: %d sequences failed before and are tried again", folder, failed)
+        return False
+    return bool(manifest.get("key") == key)
 
 
-def _is_finished(folder: Path, key: str) -> bool:
-    return (folder / "manifest.json").exists() and read_manifest(folder).get("key") == key
+def _make_all(plan: _Plan, launcher: Launcher, progress: bool) -> tuple[list[Outcome], Split]:
+    """Every sequence's outcome, and the split of those that are kept.
 
-
-def _make_all(
-    sequences: ListOf[Sequence],
-    depth_source: DepthSource,
-    options: PrepConfig,
-    folder: Path,
-    workers: int,
-    progress: bool,
-) -> list[Outcome]:
-    """Threads, not processes: decoding and depth release the interpreter lock."""
-
-    verdicts = judge_all(sequences, options)
-    kept = Counter(
-        s.category for s, verdict in zip(sequences, verdicts, strict=True) if verdict.kept
-    )
-
-    def make(sequence: Sequence, verdict: Verdict) -> Outcome:
-        lone = kept[sequence.category] == 1
-        return _make(sequence, verdict, depth_source, options, folder, lone)
-
-    folder.mkdir(parents=True, exist_ok=True)
-    with ThreadPoolExecutor(workers) as pool:
-        done = tqdm(
-            pool.map(make, sequences, verdicts),
-            "preparing",
-            len(sequences),
-            unit="sequence",
-            disable=not progress,
+    Who is tested on depends on who is left, so after failures the split is made anew, and what it
+    gives another role is made again.
+    """
+    outcomes = [
+        Outcome(sequence, verdict, failed=False)
+        for sequence, verdict in zip(
+            plan.sequences, judge_all(plan.sequences, plan.workshop.options), strict=True
         )
-        try:
-            return list(done)
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-
-
-def _make(
-    sequence: Sequence,
-    verdict: Verdict,
-    depth_source: DepthSource,
-    options: PrepConfig,
-    folder: Path,
-    lone: bool,
-) -> Outcome:
-    if not verdict.kept:
-        return Outcome(sequence, verdict, None)
-    target = frames_folder(folder, f"{sequence.category}/{sequence.name}")
-    key = frames_key(sequence, depth_source, options.image_size, lone)
-    cameras = read_camera_table(target, key)
-    if cameras is None:
-        try:
-            frames = make_frames(sequence, depth_source, options.image_size, lone)
-        except InputError as error:
-            failed = Verdict(
-                False, str(error), verdict.frames, verdict.gap_deg, verdict.coverage_deg
-            )
-            return Outcome(sequence, failed, None)
-        write_frames(target, frames, key)
-        cameras = read_camera_table(target, key)
-    return Outcome(sequence, verdict, cameras)
+    ]
+    made: dict[str, str] = {}
+    while True:
+        kept = {o.name: number for number, o in enumerate(outcomes) if o.verdict.kept}
+        if not kept:
+            raise InputError(_nothing_left(outcomes))
+        split = split_sequences(list(kept), plan.test_names)
+        roles = {name: split.role(name) for name in kept}
+        units = [
+            Unit(plan.workshop, outcomes[number].sequence, roles[name])
+            for name, number in kept.items()
+            if made.get(name) != roles[name]
+        ]
+        if not units:
+            return outcomes, split
+        done = launcher.run(prepare_unit, units)
+        bar = tqdm(done, "preparing", len(units), unit="sequence", disable=not progress)
+        for index, reason in bar:
+            unit = units[index]
+            made[unit.name] = unit.role
+            if reason:
+                reason = reason.reason if isinstance(reason, Died) else reason
+                number = kept[unit.name]
+                verdict = replace(outcomes[number].verdict, kept=False, reason=reason)
+                outcomes[number] = replace(outcomes[number], verdict=verdict, failed=True)
+                LOG.warning("left out: %s", reason)
 
 
 def _nothing_left(outcomes: list[Outcome]) -> str:

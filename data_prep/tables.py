@@ -1,30 +1,31 @@
 """The tables of prepared data: sequences with their verdicts, frames, pairs, and the manifest."""
 
 import json
-from collections.abc import Iterable
+import os
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from data_prep.filter import Verdict
-from data_prep.select import select_pairs
-from data_prep.split import Split, held_out
-from extrap_train.config import PrepConfig
+from data_prep.pairs import reference_frames
+from data_prep.split import Split
+from data_prep.unit import Unit, Workshop
 from extrap_train.data.files import write_whole
+from extrap_train.data.frame_files import read_camera_table
 from extrap_train.data.sequences import Sequence
-from extrap_train.data.store import FORMAT, matrices_of
+from extrap_train.data.store import FORMAT
 from extrap_train.errors import InputError
-from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
-from extrap_train.views import Camera
 
-MIN_DEPTH_SHARE = 0.02
-"""A frame with less of its depth known cannot be a reference: its warp would be empty."""
+_ROWS_AT_A_TIME = 50_000
+"""Rows that are gathered before they are written: memory does not grow with the sequences."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +34,8 @@ class Outcome:
 
     sequence: Sequence
     verdict: Verdict
-    cameras: pa.Table | None
-    """A row a frame; None where the sequence was dropped."""
+    failed: bool
+    """Whether it was good enough, but could not be prepared."""
 
     @property
     def name(self) -> str:
@@ -42,98 +43,123 @@ class Outcome:
         return f"{self.sequence.category}/{self.sequence.name}"
 
 
-def write_results(
-    folder: Path, outcomes: list[Outcome], split: Split, options: PrepConfig, key: str
-) -> None:
+def write_results(shop: Workshop, outcomes: list[Outcome], split: Split, key: str) -> None:
     """All tables, then the manifest, whose presence says that they are complete."""
-    kept = [outcome for outcome in outcomes if outcome.cameras is not None]
-    references = {outcome.name: _references(outcome, split) for outcome in kept}
-    pairs = pd.concat([_pairs(outcome, split, references, options) for outcome in kept])
-    if not (pairs["split"] == "train").any():
+    folder = shop.folder
+    units = [Unit(shop, o.sequence, split.role(o.name)) for o in outcomes if o.verdict.kept]
+    counts = _write_frames_and_pairs(folder, units)
+    parts: Counter[str] = Counter()
+    for (_, part), count in counts.items():
+        parts[part] += count
+    if not parts["train"]:
         raise InputError(
-            f"{folder}: no two frames of the {len(kept)} kept sequences make a training pair; "
+            f"{folder}: no two frames of the {len(units)} kept sequences make a training pair; "
             "widen prep.min_pair_angle_deg and prep.max_pair_angle_deg, or add photographs"
         )
-    frames = pa.concat_tables([_frame_rows(outcome, references[outcome.name]) for outcome in kept])
-    _write_table(folder / "frames.parquet", frames)
-    _write_table(folder / "pairs.parquet", pa.Table.from_pandas(pairs, preserve_index=False))
-    sequences = _sequence_rows(outcomes, split, pairs)
-    _write_table(
-        folder / "sequences.parquet", pa.Table.from_pandas(sequences, preserve_index=False)
-    )
+    rows = pa.Table.from_pandas(_sequence_rows(outcomes, split, counts), preserve_index=False)
+    with _writer(folder / "sequences.parquet") as write:
+        write(rows)
     write_whole(folder / "split.json", split.to_json().encode())
+    failed = sum(outcome.failed for outcome in outcomes)
     manifest = {
         "format": FORMAT,
         "key": key,
-        "options": asdict(options),
+        "options": asdict(shop.options),
+        "correction": None if shop.matcher is None else repr(shop.matcher),
+        "frames": os.path.relpath(shop.frames, folder),
         "split": json.loads(split.to_json())["sha256"],
-        "sequences": {"kept": len(kept), "dropped": len(outcomes) - len(kept)},
-        "pairs": pairs["split"].value_counts().to_dict(),
+        "sequences": {
+            "kept": len(units),
+            "dropped": len(outcomes) - len(units) - failed,
+            "failed": failed,
+        },
+        "pairs": dict(sorted(parts.items())),
         "versions": {name: version(name) for name in ("numpy", "torch", "pyarrow")},
     }
     write_whole(folder / "manifest.json", (json.dumps(manifest, indent=1) + "\n").encode())
 
 
-def _references(outcome: Outcome, split: Split) -> np.ndarray:
-    """Which frames may be references."""
-    assert outcome.cameras is not None
-    known = outcome.cameras["depth_share"].to_numpy() >= MIN_DEPTH_SHARE
-    return known & ~held_out(len(known)) if outcome.name in split.lone else known
+def _write_frames_and_pairs(folder: Path, units: list[Unit]) -> Counter[tuple[str, str]]:
+    """Both tables from the sequences' own, one after the other; pairs by sequence and split."""
+    counts: Counter[tuple[str, str]] = Counter()
+    with (
+        _writer(folder / "frames.parquet") as write_frames,
+        _writer(folder / "pairs.parquet") as write_pairs,
+    ):
+        for unit in units:
+            cameras = read_camera_table(unit.frames_folder, unit.frames_key)
+            pairs = unit.pair_files.read()
+            if cameras is None or pairs is None:
+                raise InputError(
+                    f"{unit.frames_folder}: vanished or changed meanwhile; run data_prep again"
+                )
+            write_frames(_frame_rows(unit, cameras))
+            write_pairs(pairs.replace_schema_metadata(None))
+            for part in pairs["split"].to_pylist():
+                counts[unit.name, part] += 1
+    return counts
 
 
-def _pairs(
-    outcome: Outcome, split: Split, references: dict[str, np.ndarray], options: PrepConfig
-) -> pd.DataFrame:
-    """A sequence's pairs; a lone sequence has some for training and some for testing."""
-    assert outcome.cameras is not None
-    frames = outcome.cameras.num_rows
-    camera = Camera(
-        matrices_of(outcome.cameras, "world_to_cam", (4, 4)),
-        matrices_of(outcome.cameras, "intrinsics", (3, 3)),
-        options.image_size,
-        options.image_size,
-    )
-    angles = pairwise_angles(camera, scene_center(camera))
-    if outcome.name in split.lone:
-        queries = {"train": ~held_out(frames), "test": held_out(frames)}
-    else:
-        queries = {split.role(outcome.name): np.ones(frames, bool)}
-    parts = []
-    for part, allowed in queries.items():
-        chosen = select_pairs(angles, options, allowed, references[outcome.name])
-        rows = pd.DataFrame(vars(chosen)).astype({"reference": "int32", "query": "int32"})
-        parts.append(rows.assign(sequence=outcome.name, split=part))
-    return pd.concat(parts)
-
-
-def _frame_rows(outcome: Outcome, references: np.ndarray) -> pa.Table:
-    assert outcome.cameras is not None
-    names = pa.array([outcome.name] * outcome.cameras.num_rows, pa.string())
-    rows = outcome.cameras.replace_schema_metadata(None).add_column(0, "sequence", names)
+def _frame_rows(unit: Unit, cameras: pa.Table) -> pa.Table:
+    shares = cameras["depth_share"].to_numpy()
+    references = reference_frames(shares, unit.role == "train and test")
+    names = pa.array([unit.name] * cameras.num_rows, pa.string())
+    rows = cameras.replace_schema_metadata(None).add_column(0, "sequence", names)
     return rows.append_column("reference", pa.array(references))
 
 
-def _sequence_rows(outcomes: Iterable[Outcome], split: Split, pairs: pd.DataFrame) -> pd.DataFrame:
-    counts = pairs["sequence"].value_counts()
+def _sequence_rows(
+    outcomes: list[Outcome], split: Split, counts: Counter[tuple[str, str]]
+) -> pd.DataFrame:
     rows: list[dict[str, Any]] = [
         {
             "sequence": outcome.name,
             **asdict(outcome.verdict),
-            "kept": outcome.cameras is not None,
+            "failed": outcome.failed,
             "viewpoint_quality": outcome.sequence.viewpoint_quality,
             "point_cloud_quality": outcome.sequence.point_cloud_quality,
-            "split": split.role(outcome.name) if outcome.cameras is not None else "",
-            "pairs": int(counts.get(outcome.name, 0)),
+            "split": split.role(outcome.name) if outcome.verdict.kept else "",
+            "pairs": sum(counts[outcome.name, part] for part in ("train", "test")),
         }
         for outcome in outcomes
     ]
     return pd.DataFrame(rows)
 
 
-def _write_table(file: Path, table: pa.Table) -> None:
+class _Rows:
+    """Tables of one schema, gathered until it is worth writing them."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self.waiting: list[pa.Table] = []
+        self.writer: pq.ParquetWriter | None = None
+
+    def add(self, table: pa.Table) -> None:
+        """Take rows, and write what has come together if it is enough."""
+        self.waiting.append(table)
+        if sum(part.num_rows for part in self.waiting) >= _ROWS_AT_A_TIME:
+            self.write()
+
+    def write(self) -> None:
+        """Write what waits."""
+        if not self.waiting:
+            return
+        rows = pa.concat_tables(self.waiting)
+        self.waiting.clear()
+        self.writer = self.writer or pq.ParquetWriter(self.file, rows.schema)
+        self.writer.write_table(rows)
+
+
+@contextmanager
+def _writer(file: Path) -> Iterator[Any]:
+    """A function that takes the rows of `file`, which is there whole or not at all."""
     temporary = file.with_name(f".{file.name}.tmp")
+    rows = _Rows(temporary)
     try:
-        pq.write_table(table, temporary)
-        temporary.replace(file)
+        yield rows.add
+        rows.write()
+        if rows.writer is not None:
+            rows.writer.close()
+            temporary.replace(file)
     finally:
         temporary.unlink(missing_ok=True)

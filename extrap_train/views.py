@@ -203,6 +203,9 @@ class PairBatch:
     reference_depths: Float[Tensor, "b k h w"]
     reference_valid: Bool[Tensor, "b k"]
     """False for a place without a reference: every example has at least one, the first."""
+    reference_flows: Float[Tensor, "b k 2 g g"] | None = None
+    """Where each reference's warp really belongs (`geometry.flow`); None leaves all where they
+    are."""
     warp: Warp | None = None
     """Made from the references when the batch is made; None before."""
 

@@ -32,6 +32,7 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "launcher.memory_gib": (0.5, 4096),
     "launcher.hours": (0.02, 10_000),
     "prep.image_size": (1, 4096),
+    "prep.correction_grid": (4, 64),
     "prep.max_uses": (1, math.inf),
     "model.patch": (1, 64),
     "model.references": (1, 16),

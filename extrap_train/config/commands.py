@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from extrap_train.config.data import CategoryConfig, DataConfig, PrepConfig
 from extrap_train.config.depth import DepthConfig
 from extrap_train.config.launcher import LauncherConfig
+from extrap_train.config.matching import MatcherConfig
 from extrap_train.config.model import ModelConfig, SamplerConfig
 from extrap_train.config.training import TrainerConfig, ValidationConfig
 from extrap_train.config.tree import MISSING
@@ -17,6 +18,7 @@ class TrainConfig:
     category: CategoryConfig = MISSING
     data: DataConfig = MISSING
     depth: DepthConfig = MISSING
+    matcher: MatcherConfig = MISSING
     model: ModelConfig = MISSING
     prep: PrepConfig = field(default_factory=PrepConfig)
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
@@ -41,6 +43,7 @@ class DataPrepConfig:
     category: CategoryConfig = MISSING
     data: DataConfig = MISSING
     depth: DepthConfig = MISSING
+    matcher: MatcherConfig = MISSING
     launcher: LauncherConfig = MISSING
     prep: PrepConfig = field(default_factory=PrepConfig)
     output: str = "outputs"

@@ -70,3 +70,8 @@ class PrepConfig:
     """A pair is skipped if a chosen one has both its frames within this angle of its own."""
     full_circle: str = "prefer"
     """No full circle: `require` drops it, `prefer` unless nothing is one, `ignore` never."""
+    correct: bool | None = None
+    """Correct training warps by matching them to the truth; null wherever depth is not exact, which
+    only that of synthetic data is."""
+    correction_grid: int = 12
+    """Control points of a correction along each side."""

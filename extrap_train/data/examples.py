@@ -23,6 +23,7 @@ class Example:
     reference_images: Float[Tensor, "k 3 h w"]
     reference_cameras: Camera
     reference_depths: Float[Tensor, "k h w"]
+    reference_flows: Float[Tensor, "k 2 g g"] | None = None
 
 
 def mirrored(example: Example) -> Example:
@@ -33,7 +34,12 @@ def mirrored(example: Example) -> Example:
         example.reference_images.flip(-1),
         _mirrored_camera(example.reference_cameras),
         example.reference_depths.flip(-1),
+        None if example.reference_flows is None else _mirrored_flows(example.reference_flows),
     )
+
+
+def _mirrored_flows(flows: Float[Tensor, "k 2 g g"]) -> Float[Tensor, "k 2 g g"]:
+    return flows.flip(-1) * flows.new_tensor([-1.0, 1.0])[:, None, None]
 
 
 def _mirrored_camera(camera: Camera) -> Camera:
@@ -60,7 +66,19 @@ def collate(examples: Sequence[Example], references: int) -> PairBatch:
         reference_cameras=stack_cameras([e.reference_cameras[torch.tensor(o)] for e, o in pairs]),
         reference_depths=torch.stack([e.reference_depths[o] for e, o in pairs]),
         reference_valid=torch.tensor(valid),
+        reference_flows=_flows([(e.reference_flows, o) for e, o in pairs]),
     )
+
+
+def _flows(
+    chosen: Sequence[tuple[Float[Tensor, "_ 2 g g"] | None, list[int]]],
+) -> Float[Tensor, "b k 2 g g"] | None:
+    """None where no example has any; those of examples without are zero."""
+    known = [flows for flows, _ in chosen if flows is not None]
+    if not known:
+        return None
+    none = torch.zeros(len(chosen[0][1]), *known[0].shape[1:])
+    return torch.stack([none if flows is None else flows[order] for flows, order in chosen])
 
 
 class ExampleReader:
@@ -68,7 +86,7 @@ class ExampleReader:
 
     def __init__(self, prepared: list[PreparedData], split: str, references: int) -> None:
         self.references = references
-        self._prepared = prepared
+        self._split = split
         self._pairs = [(data, pair) for data in prepared for pair in data.pairs(split)]
         self._angles: dict[tuple[Path, str], np.ndarray] = {}
 
@@ -90,12 +108,19 @@ class ExampleReader:
         data, pair = self._pairs[index]
         first = pair.references[0]
         angles = self._angles_of(data, pair.sequence)
-        candidates = data.reference_frames(pair.sequence)
+        corrected = self._split == "train" and data.is_corrected
+        # Further references only from frames whose own correction is known.
+        candidates = (
+            data.partners(pair.sequence, pair.query)
+            if corrected
+            else data.reference_frames(pair.sequence)
+        )
         further = extra_references(angles, pair.query, first, count, rng, candidates)
         frames = [pair.query, first, *further]
         images, depths, _ = data.frames(pair.sequence, frames)
         cameras = data.cameras(pair.sequence)[torch.tensor(frames)]
-        return Example(images[0], cameras[0], images[1:], cameras[1:], depths[1:])
+        flows = data.flows(pair.sequence, frames[1:], pair.query) if corrected else None
+        return Example(images[0], cameras[0], images[1:], cameras[1:], depths[1:], flows)
 
     def collate(self, examples: list[Example]) -> PairBatch:
         """A batch with room for the reader's number of references."""

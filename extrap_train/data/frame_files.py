@@ -11,10 +11,14 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+import torch
 from jaxtyping import Float, UInt8
+from torch import Tensor
 
 from extrap_train.views import Camera
 
+FLOWS = "flows.npy"
+"""Of the pairs of one sequence, beside their table: control vectors (`geometry.flow`)."""
 IMAGES, DEPTHS, MASKS, CAMERAS = "images.npy", "depth.npy", "mask.npy", "frames.parquet"
 _KEY = b"key"
 _SAFE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}")
@@ -32,9 +36,55 @@ class SequenceFrames:
     """255 is the object; 255 everywhere where the capture has no mask."""
 
 
+@dataclass(frozen=True)
+class StoredFrames:
+    """A prepared sequence's frames on disk, read one at a time."""
+
+    folder: Path
+    camera: Camera
+    depth_share: Float[np.ndarray, "n"]
+    """Of each frame's pixels, how many have a depth."""
+    depth_scale: float
+
+    @classmethod
+    def open(cls, folder: Path, table: pa.Table) -> "StoredFrames":
+        """From `read_camera_table`'s table."""
+        height, width = np.load(folder / MASKS, mmap_mode="r").shape[1:]
+        camera = Camera(
+            matrices_of(table, "world_to_cam", (4, 4)),
+            matrices_of(table, "intrinsics", (3, 3)),
+            height,
+            width,
+        )
+        scale = float(table["depth_scale"][0].as_py())
+        return cls(folder, camera, table["depth_share"].to_numpy(), scale)
+
+    def image(self, index: int) -> Float[Tensor, "3 h w"]:
+        """Colours in [0, 1]."""
+        pixels = np.load(self.folder / IMAGES, mmap_mode="r")[index]
+        return torch.from_numpy(np.array(pixels)).permute(2, 0, 1).contiguous().float().div_(255)
+
+    def depth(self, index: int) -> Float[Tensor, "h w"]:
+        """In scene units; 0 is unknown."""
+        stored = np.load(self.folder / DEPTHS, mmap_mode="r")[index]
+        return torch.from_numpy(np.array(stored)).float().mul_(self.depth_scale)
+
+
+def sequence_folder(root: Path, kind: str, sequence: str) -> Path:
+    """Where one kind of files of `category/name` lies; both are untrusted and never lead out of
+    `root`."""
+    return root.joinpath(kind, *(_safe(part) for part in sequence.split("/", 1)))
+
+
 def frames_folder(root: Path, sequence: str) -> Path:
-    """Where the frames of `category/name` lie; both are untrusted and never lead out of `root`."""
-    return root.joinpath("frames", *(_safe(part) for part in sequence.split("/", 1)))
+    """Where the frames of `category/name` lie."""
+    return sequence_folder(root, "frames", sequence)
+
+
+def matrices_of(table: pa.Table, column: str, shape: tuple[int, int]) -> Float[Tensor, "n r c"]:
+    """A column of flattened matrices as a tensor."""
+    values = table[column].combine_chunks().flatten().to_numpy()
+    return torch.from_numpy(np.array(values, np.float32).reshape(-1, *shape))
 
 
 def write_frames(folder: Path, frames: SequenceFrames, key: str) -> None:

@@ -31,6 +31,7 @@ def with_warp(batch: PairBatch, image_size: int | None = None) -> PairBatch:
         batch.reference_cameras,
         batch.reference_valid,
         batch.camera,
+        batch.reference_flows,
     )
     factor = 1 if image_size is None else batch.camera.height // image_size
     return reduced_batch(replace(batch, warp=warp), factor)

@@ -5,12 +5,15 @@
          frames.parquet      a row a frame: name, camera, whether it may serve as a reference
          pairs.parquet       a row an ordered pair (reference → query)
          split.json          test sequences (or frames), with a hash
-         frames/<category>/<sequence>/{images,depth,mask}.npy, frames.parquet
+         pairs/<category>/<sequence>/flows.npy, pairs.parquet
+<frames>/frames/<category>/<sequence>/{images,depth,mask}.npy, frames.parquet
+
+Frames lie in a folder that other preparations may share; the manifest says which.
 """
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -23,13 +26,23 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from extrap_train.data.frame_files import DEPTHS, IMAGES, MASKS, frames_folder
+from extrap_train.data.frame_files import (
+    DEPTHS,
+    FLOWS,
+    IMAGES,
+    MASKS,
+    frames_folder,
+    matrices_of,
+    sequence_folder,
+)
 from extrap_train.errors import InputError
 from extrap_train.views import Camera, ViewPair
 
-FORMAT = 1
+FORMAT = 2
+UNTOUCHED = -1
+"""In place of the number of a flow: the warp of that pair stays as it is."""
 _OPEN_SEQUENCES = 128
-"""Sequences whose files stay open: three descriptors each, and a process has about a thousand."""
+"""Sequences whose files stay open: four descriptors each, and a process has about a thousand."""
 
 Arrays = tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -43,6 +56,13 @@ class Pairs:
     reference: Int[np.ndarray, "m"]
     angle_rad: Float[np.ndarray, "m"]
     score: Float[np.ndarray, "m"]
+    flow: Int[np.ndarray, "m"]
+    """Number of the pair's flow in its sequence; `UNTOUCHED` of none."""
+    error_before: Float[np.ndarray, "m"]
+    """Photometric error of the warp against the truth; NaN where nothing was compared."""
+    error_after: Float[np.ndarray, "m"]
+    uncorrected: np.ndarray
+    """Why a compared warp stays as it is; else empty."""
 
     def __len__(self) -> int:
         return len(self.query)
@@ -79,6 +99,12 @@ class PreparedData:
         self._reference = frames["reference"].to_numpy()
         self._names = frames["name"]
         self._rows = _row_ranges(frames["sequence"].to_numpy())
+        self._frames_root = folder / manifest["frames"]
+        self._pair_rows = _row_ranges(pairs["sequence"].to_numpy())
+        self._flow_numbers: Callable[[str], np.ndarray] = lru_cache(_OPEN_SEQUENCES)(
+            self._read_flow_numbers
+        )
+        self._flows: Callable[[str], np.ndarray] = lru_cache(_OPEN_SEQUENCES)(self._open_flows)
         self._arrays: Callable[[str], Arrays] = lru_cache(_OPEN_SEQUENCES)(self._open_arrays)
 
     @classmethod
@@ -102,8 +128,7 @@ class PreparedData:
         if split not in ("train", "test"):
             raise ValueError(f"split is train or test, not {split!r}")
         rows = self._pairs[self._pairs["split"] == split]
-        names = ("sequence", "query", "reference", "angle_rad", "score")
-        return Pairs(*(rows[name].to_numpy() for name in names))
+        return Pairs(*(rows[field.name].to_numpy() for field in fields(Pairs)))
 
     def cameras(self, sequence: str) -> Camera:
         """All cameras of a sequence, at the store's image size."""
@@ -132,8 +157,44 @@ class PreparedData:
             torch.from_numpy(masks[chosen]).float().div_(255),
         )
 
+    @property
+    def is_corrected(self) -> bool:
+        """Whether the training pairs have been compared with the truth (METHOD §6)."""
+        return bool(self.manifest["correction"])
+
+    def partners(self, sequence: str, query: int) -> Int[np.ndarray, "m"]:
+        """The frames that make a training pair with this query, so that their flow is known."""
+        return np.flatnonzero(self._flow_numbers(sequence)[:, query] >= UNTOUCHED)
+
+    def flows(
+        self, sequence: str, references: Sequence[int], query: int
+    ) -> Float[Tensor, "k 2 g g"]:
+        """Where the warp of each reference really belongs in the query (`geometry.flow`); zero
+        where it stays as it is."""
+        numbers = self._flow_numbers(sequence)[list(references), query]
+        stored = self._flows(sequence)
+        chosen = np.zeros((len(numbers), *stored.shape[1:]), np.float32)
+        chosen[numbers >= 0] = stored[numbers[numbers >= 0]]
+        return torch.from_numpy(chosen)
+
+    def _read_flow_numbers(self, sequence: str) -> Int[np.ndarray, "n n"]:
+        """By reference and query; what is no training pair is less than `UNTOUCHED`."""
+        frames = self._rows[sequence]
+        numbers = np.full(2 * (frames.stop - frames.start,), UNTOUCHED - 1, np.int32)
+        rows = self._pairs.iloc[self._pair_rows.get(sequence, slice(0, 0))]
+        rows = rows[rows["split"] == "train"]
+        numbers[rows["reference"], rows["query"]] = rows["flow"]
+        return numbers
+
+    def _open_flows(self, sequence: str) -> np.ndarray:
+        file = sequence_folder(self.folder, "pairs", sequence) / FLOWS
+        try:
+            return np.load(file, mmap_mode="r")
+        except (OSError, ValueError, EOFError) as error:
+            raise _damaged(self.folder, f"{file}: {error}") from None
+
     def _open_arrays(self, sequence: str) -> Arrays:
-        folder = frames_folder(self.folder, sequence)
+        folder = frames_folder(self._frames_root, sequence)
         count = self._rows[sequence].stop - self._rows[sequence].start
         square = (count, self.image_size, self.image_size)
         try:
@@ -176,12 +237,6 @@ def _read_table(folder: Path, name: str) -> pa.Table:
 
 def _damaged(folder: Path, what: str) -> InputError:
     return InputError(f"{folder} is damaged ({what}); delete that folder and run data_prep again")
-
-
-def matrices_of(table: pa.Table, column: str, shape: tuple[int, int]) -> Float[Tensor, "n r c"]:
-    """A column of flattened matrices as a tensor."""
-    values = table[column].combine_chunks().flatten().to_numpy()
-    return torch.from_numpy(np.array(values, np.float32).reshape(-1, *shape))
 
 
 def _row_ranges(sequences: np.ndarray) -> dict[str, slice]:

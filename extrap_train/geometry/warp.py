@@ -14,6 +14,7 @@ from torch import Tensor
 from extrap_train.geometry.splat import needs_torch
 from extrap_train.geometry.splat_numba import splat_numba
 from extrap_train.geometry.splat_torch import splat_torch
+from extrap_train.geometry.warp_flow import move_points_numba, moved_points
 from extrap_train.geometry.warp_points import sample_surfaces
 from extrap_train.geometry.warp_points_numba import sample_surfaces_numba
 from extrap_train.views import Camera, Warp
@@ -28,19 +29,26 @@ def warp_references(
     cameras: Camera,
     valid: Bool[Tensor, "b k"],
     query: Camera,
+    flows: Float[Tensor, "b k 2 g g"] | None = None,
 ) -> Warp:
     """Fuse all references of each query view in one depth-aware splat; reference 0 is the nearest.
 
     `cameras` is batched `b k` and `query` `b`; the query's image size may differ from the
     references'. Depth 0 (or not finite) is unknown, and `valid` False leaves a reference out.
+    `flows` moves each reference's points in the query image before they are drawn (`geometry.flow`,
+    METHOD §6): colours, coordinates, depth and mask go together, and nothing is resampled twice.
     """
     depths = torch.where(valid[..., None, None], depths, 0)
     if needs_torch(images, depths):
         samples = sample_surfaces(images, depths, cameras, query)
-        size = (len(images), query.height, query.width)
-        means = splat_torch(samples.points, samples.values, size)
+        points = samples.points
+        if flows is not None:
+            points = moved_points(points, samples.reference, flows, query)
+        means = splat_torch(points, samples.values, (len(images), query.height, query.width))
     else:
         drawn = sample_surfaces_numba(images, depths, cameras, query)
+        if flows is not None:
+            move_points_numba(drawn[0], drawn[3], flows, query)
         means = splat_numba(*drawn, query.height, query.width)
     weight = means[:, 7]
     share = means[:, 5]

@@ -37,6 +37,8 @@ class Samples:
     points: ScreenPoints
     values: Float[Tensor, "n 7"]
     """Colour (3), coordinates in the nearest reference (2) and whether it is from there, depth."""
+    reference: Int[Tensor, "n"]
+    """Which of the b·k references a point is from, in ascending order."""
 
 
 def sample_surfaces(
@@ -77,7 +79,7 @@ def sample_surfaces(
     maps = _maps(images).movedim(2, -1).reshape(b * k * h * w, -1)
     values = corner.interpolate(maps, pixel, offset, seen[kept])
     values = torch.cat([values, points.depth[:, None]], 1)
-    return Samples(replace(points, image=points.image // k), values)
+    return Samples(replace(points, image=points.image // k), values, points.image)
 
 
 def query_centers(cameras: Camera, query: Camera) -> Float[Tensor, "b k 3"]:

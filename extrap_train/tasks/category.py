@@ -99,6 +99,7 @@ def _prepared(config: TrainConfig) -> list[PreparedData]:
             config.prep,
             output=Path(config.output),
             workers=config.threads or len(os.sched_getaffinity(0)),
+            matcher=config.matcher,
         )
         for member in config.category.members
     ]

@@ -4,19 +4,24 @@ preparation.
 
 import hashlib
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
-from filelock import FileLock
+from filelock import FileLock, Timeout
 
 from data_prep.build import prepare
 from data_prep.synthesize import synthesize
 from extrap_train.config import (
     Co3dConfig,
     DataConfig,
+    DatasetDepthConfig,
     DepthConfig,
     LauncherConfig,
     LocalConfig,
+    MatcherConfig,
     PrepConfig,
     SyntheticConfig,
 )
@@ -26,6 +31,7 @@ from extrap_train.data.store import PreparedData
 from extrap_train.depth.build import depth_source
 from extrap_train.jobs import Launcher
 from extrap_train.jobs.build import open_launcher
+from extrap_train.matching.build import matcher as build_matcher
 
 LOCAL = LocalConfig()
 
@@ -38,14 +44,22 @@ def prepare_category(
     *,
     output: Path,
     workers: int,
+    matcher: MatcherConfig,
     launcher: LauncherConfig = LOCAL,
+    retry: bool = False,
 ) -> PreparedData:
-    """Sequences of one category as pairs on disk; what is there already is used again."""
-    folder = output / "data" / f"{category}-{_digest(category, data, depth, prep)}"
+    """Sequences of one category as pairs on disk; what is there already is used again.
+
+    With `retry`, sequences that failed before are tried again.
+    """
+    correct = is_corrected(data, depth, prep)
+    made_from = [category, asdict(data), asdict(depth)]
+    digest = _digest([*made_from, asdict(prep), asdict(matcher) if correct else None])
+    folder = output / "data" / f"{category}-{digest}"
+    frames = output / "frames" / f"{category}-{_digest([*made_from, prep.image_size])}"
     folder.parent.mkdir(parents=True, exist_ok=True)
-    # The jobs of a sweep share their data: the first one makes it, the others wait.
     with (
-        FileLock(folder.parent / f".{category}.lock"),
+        _alone(folder.parent / f".{category}.lock"),
         open_launcher(launcher, workers, folder.parent / "slurm") as opened,
     ):
         sequences, test_names = _sequences(category, data, output, opened)
@@ -55,8 +69,30 @@ def prepare_category(
             prep,
             test_names=test_names,
             folder=folder,
-            workers=workers,
+            frames=frames,
+            matcher=build_matcher(matcher) if correct else None,
+            launcher=opened,
+            retry=retry,
         )
+
+
+def is_corrected(data: DataConfig, depth: DepthConfig, prep: PrepConfig) -> bool:
+    """Whether training warps are corrected: as asked, else wherever depth is not exact."""
+    if prep.correct is not None:
+        return prep.correct
+    return not (isinstance(data, SyntheticConfig) and isinstance(depth, DatasetDepthConfig))
+
+
+@contextmanager
+def _alone(lock: Path) -> Iterator[None]:
+    """The jobs of a sweep share their data: the first one makes it, the others wait and say so."""
+    try:
+        held = FileLock(lock).acquire(timeout=0)
+    except Timeout:
+        print(f"{lock.parent}: another process prepares this category; waiting for it")
+        held = FileLock(lock).acquire()
+    with held:
+        yield
 
 
 def _sequences(
@@ -73,6 +109,5 @@ def _sequences(
     return read_category(Path(data.root), category), data.test_sequences
 
 
-def _digest(category: str, data: DataConfig, depth: DepthConfig, prep: PrepConfig) -> str:
-    parts = [category, asdict(data), asdict(depth), asdict(prep)]
+def _digest(parts: list[Any]) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:8]

@@ -162,4 +162,4 @@ def test_an_unfinished_preparation_says_so(tmp_path: Path) -> None:
 def test_the_manifest_states_what_it_was_made_from(folder: Path) -> None:
     manifest = json.loads((folder / "manifest.json").read_text())
     assert manifest["options"]["image_size"] == SIZE
-    assert manifest["sequences"] == {"kept": 4, "dropped": 0}
+    assert manifest["sequences"] == {"kept": 4, "dropped": 0, "failed": 0}

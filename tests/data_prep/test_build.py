@@ -44,7 +44,6 @@ def run(folder: Path, sequences, test_names=2, depth: DepthSource | None = None,
         options,
         test_names=test_names,
         folder=folder,
-        workers=2,
         progress=False,
     )
 

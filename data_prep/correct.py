@@ -1,0 +1,131 @@
+"""Warp correction: where a pair's warp really belongs in its query view (METHOD §6, paper III-A.1).
+
+Wrong depths shift the warped image against the true one. A matcher finds where the warp's pixels
+are in the truth, a smooth flow is fitted to what is no outlier, and the warp is drawn again with
+its points moved by it. A correction must prove itself: where neither the picture comes closer to
+the truth nor the matches to where they belong, the warp stays as it is.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+from extrap_train.geometry.flow import fit_flow, flow_at
+from extrap_train.geometry.warp import warp_references
+from extrap_train.matching import Matcher
+from extrap_train.views import Camera, Warp, stack_cameras
+
+LEAST_MATCHES = 40
+"""Fewer do not tell a smooth motion from chance."""
+LEAST_INLIERS = 0.5
+"""Share of the matches that a smooth motion must explain."""
+LEAST_GAIN = 0.05
+"""Share of the photometric error that a correction must take away: exact depths are not moved."""
+MOST_MATCHES = 2000
+"""A smooth field needs no more."""
+
+
+@dataclass(frozen=True)
+class Correction:
+    """What came of one pair."""
+
+    flow: Float[Tensor, "2 g g"] | None
+    """Control vectors (`geometry.flow`); None where the warp stays as it is."""
+    error_before: float
+    """Photometric error of the warp against the truth, over what the warp shows; NaN of none."""
+    error_after: float
+    reason: str = ""
+    """Why the warp stays as it is."""
+
+
+def correct_pair(
+    image: Float[Tensor, "3 h w"],
+    depth: Float[Tensor, "h w"],
+    reference: Camera,
+    truth: Float[Tensor, "3 h w"],
+    query: Camera,
+    matcher: Matcher,
+    grid: int,
+) -> Correction:
+    """The flow that brings a reference's warp to where the true query image shows the same.
+
+    `grid` is the number of control points along each side of the flow.
+    """
+    before = _warp(image, depth, reference, query)
+    error_before = photometric_error(before, truth)
+    matches = matcher.match(before.image[0], truth, before.mask[0] > 0)
+    if len(matches) < LEAST_MATCHES:
+        return Correction(None, error_before, error_before, f"only {len(matches)} matches")
+    chosen = torch.linspace(0, len(matches) - 1, min(len(matches), MOST_MATCHES)).long()
+    matches = matches[chosen]
+    size = torch.tensor([query.width, query.height])
+    positions, steps = matches.first / size * 2 - 1, matches.first_to_second / size * 2
+    flow, inliers = fit_flow(positions, steps, matches.confidence, grid)
+    share = float(inliers.float().mean())
+    if share < LEAST_INLIERS:
+        reason = f"{share:.0%} of the matches move together"
+        return Correction(None, error_before, error_before, reason)
+    if not _explains(flow, positions[inliers], steps[inliers]):
+        return Correction(None, error_before, error_before, "the matches have no motion in common")
+    # As it is stored, so that what is judged is what training draws.
+    flow = flow.half().float()
+    after = _warp(image, depth, reference, query, flow)
+    error_before, error_after = errors_in_common(before, after, truth)
+    if not error_after <= error_before * (1 - LEAST_GAIN):
+        return Correction(None, error_before, error_before, "the picture comes no closer")
+    return Correction(flow, error_before, error_after)
+
+
+def _warp(
+    image: Float[Tensor, "3 h w"],
+    depth: Float[Tensor, "h w"],
+    reference: Camera,
+    query: Camera,
+    flow: Float[Tensor, "2 g g"] | None = None,
+) -> Warp:
+    return warp_references(
+        image[None, None],
+        depth[None, None],
+        stack_cameras([stack_cameras([reference])]),
+        torch.ones(1, 1, dtype=torch.bool),
+        stack_cameras([query]),
+        None if flow is None else flow[None, None],
+    )
+
+
+def _explains(
+    flow: Float[Tensor, "2 g g"], positions: Float[Tensor, "n 2"], steps: Float[Tensor, "n 2"]
+) -> bool:
+    """Whether the matches lie nearer to where they belong once the warp has moved."""
+    left = (steps - flow_at(flow, positions)).norm(dim=1).median()
+    return bool(left < steps.norm(dim=1).median())
+
+
+def photometric_error(
+    warp: Warp, truth: Float[Tensor, "3 h w"], where: Bool[Tensor, "h w"] | None = None
+) -> float:
+    """Mean absolute difference in colour over what the warp shows; NaN where it shows nothing.
+
+    Both pictures are smoothed a little first: single pixels are a matter of sampling.
+    """
+    seen = warp.mask[0] > 0 if where is None else where
+    if not seen.any():
+        return float("nan")
+    weight = seen.float()[None, None]
+    difference = (_smoothed((warp.image - truth) * weight) / _smoothed(weight).clamp_min(1e-6))[0]
+    return float(difference.abs().mean(0)[seen].mean())
+
+
+def _smoothed(image: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+    return functional.avg_pool2d(image, 3, 1, 1, count_include_pad=False)
+
+
+def errors_in_common(
+    before: Warp, after: Warp, truth: Float[Tensor, "3 h w"]
+) -> tuple[float, float]:
+    """Both errors over the pixels that both warps show, so that neither wins by showing less."""
+    both = (before.mask[0] > 0) & (after.mask[0] > 0)
+    return photometric_error(before, truth, both), photometric_error(after, truth, both)

@@ -1,0 +1,109 @@
+"""The preparation of one sequence: its frames with depth, then its pairs with their corrections.
+
+A unit is a job of its own: it reads the sequence's photographs, writes the sequence's folders and
+returns a word. What is finished is left alone, so that a unit that is asked for twice costs
+nothing.
+"""
+
+import errno
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+from data_prep.frames import frames_key, make_frames
+from data_prep.pairs import PairFiles, make_pairs
+from extrap_train.config import PrepConfig
+from extrap_train.data.frame_files import (
+    StoredFrames,
+    frames_folder,
+    read_camera_table,
+    write_frames,
+)
+from extrap_train.data.sequences import Sequence
+from extrap_train.depth import DepthSource
+from extrap_train.errors import InputError
+from extrap_train.matching import Matcher
+
+LOG = logging.getLogger(__name__)
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
+"""What ends the whole run: the next sequence would find no room either."""
+
+
+@dataclass(frozen=True)
+class Workshop:
+    """What all units of a preparation share; small, because every job takes it along."""
+
+    depth_source: DepthSource
+    options: PrepConfig
+    matcher: Matcher | None
+    """What warps are corrected with; None leaves them."""
+    frames: Path
+    """Root of the frames, which preparations with other pair options share."""
+    folder: Path
+    """Root of the pairs."""
+
+
+@dataclass(frozen=True)
+class Unit:
+    """One sequence, and what it is for."""
+
+    workshop: Workshop
+    sequence: Sequence
+    role: str
+    """`train`, `test` or `train and test` (`split.Split.role`)."""
+
+    @property
+    def name(self) -> str:
+        """`category/name`, as the prepared data calls it."""
+        return f"{self.sequence.category}/{self.sequence.name}"
+
+    @property
+    def frames_key(self) -> str:
+        """What the frames are made from."""
+        shop, lone = self.workshop, self.role == "train and test"
+        return frames_key(self.sequence, shop.depth_source, shop.options.image_size, lone)
+
+    @property
+    def frames_folder(self) -> Path:
+        """Where they lie."""
+        return frames_folder(self.workshop.frames, self.name)
+
+    @property
+    def pair_files(self) -> PairFiles:
+        """Where the pairs lie, and what they are made from."""
+        shop = self.workshop
+        how = "" if shop.matcher is None else repr(shop.matcher)
+        return PairFiles.of(shop.folder, self.name, self.frames_key, self.role, shop.options, how)
+
+
+def prepare_unit(unit: Unit) -> str:
+    """Make what the sequence lacks; returns why it cannot be used, or nothing.
+
+    Whatever goes wrong with one sequence stays with it, bugs included, whose trace is logged. A
+    full disk is raised.
+    """
+    try:
+        _prepare(unit)
+    except InputError as error:
+        return str(error)
+    except OSError as error:
+        if error.errno in NO_SPACE:
+            raise
+        return f"sequence {unit.name}: {error}"
+    except Exception as error:
+        LOG.exception("sequence %s is left out: %r", unit.name, error)
+        return f"sequence {unit.name}: {type(error).__name__}: {error}"
+    return ""
+
+
+def _prepare(unit: Unit) -> None:
+    shop, key = unit.workshop, unit.frames_key
+    table = read_camera_table(unit.frames_folder, key)
+    if table is None:
+        lone = unit.role == "train and test"
+        frames = make_frames(unit.sequence, shop.depth_source, shop.options.image_size, lone)
+        write_frames(unit.frames_folder, frames, key)
+        table = read_camera_table(unit.frames_folder, key)
+        assert table is not None
+    stored = StoredFrames.open(unit.frames_folder, table)
+    make_pairs(unit.pair_files, stored, unit.name, unit.role, shop.options, shop.matcher)
