@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from benchmarks.methods.gaussians.arrays import array
 from benchmarks.methods.gaussians.blend_numba import (
     FEATURES,
     MEAN,
@@ -60,9 +61,9 @@ class _Blend(torch.autograd.Function):
         depths: Tensor,
         size: tuple[int, int],
     ) -> tuple[Tensor, Tensor]:
-        inputs = [_array(x) for x in (means, shapes, opacities, features, background)]
+        inputs = [array(x) for x in (means, shapes, opacities, features, background)]
         height, width = size
-        tiles = sort_into_tiles(inputs[0], _array(radii), _array(depths), width, height)
+        tiles = sort_into_tiles(inputs[0], array(radii), array(depths), width, height)
         image = means.new_empty(height, width, features.shape[1])
         transmittance = means.new_empty(height, width)
         ends = np.empty(size, np.int64)
@@ -77,7 +78,7 @@ class _Blend(torch.autograd.Function):
     def backward(
         ctx: Any, image_grad: Tensor, transmittance_grad: Tensor
     ) -> tuple[Tensor | None, ...]:
-        *inputs, transmittance = (_array(x) for x in ctx.saved_tensors)
+        *inputs, transmittance = (array(x) for x in ctx.saved_tensors)
         tiles, features = ctx.tiles, inputs[3]
         columns = FEATURES + features.shape[1]
         slot_grads = np.zeros((len(tiles.slots), columns), features.dtype)
@@ -89,8 +90,8 @@ class _Blend(torch.autograd.Function):
             tiles.slots,
             transmittance,
             ctx.ends,
-            _array(image_grad),
-            _array(transmittance_grad),
+            array(image_grad),
+            array(transmittance_grad),
             slot_grads,
         )
         add_slots(tiles.slot_starts, slot_grads, grads.numpy())
@@ -105,7 +106,3 @@ class _Blend(torch.autograd.Function):
             None,
             None,
         )
-
-
-def _array(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().contiguous().numpy()

@@ -15,6 +15,8 @@ from benchmarks.methods.gaussians.spherical_harmonics import sh_colors
 from extrap_train.errors import InputError
 from extrap_train.views import Camera
 
+Backend = Literal["numba", "gsplat"]
+"""What draws: ours on the CPU, or gsplat on CUDA."""
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 _LEAST_DIVISOR = 1e-10
 
@@ -22,7 +24,7 @@ Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 """The signature of `rasterization` below, which is the common part of gsplat's."""
 
 
-def rasterizer(name: Literal["numba", "gsplat"]) -> Rasterization:
+def rasterizer(name: Backend) -> Rasterization:
     """The drawing function of that name: `numba` on the CPU, `gsplat` on CUDA."""
     if name == "numba":
         return rasterization

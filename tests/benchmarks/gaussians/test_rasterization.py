@@ -117,7 +117,7 @@ def test_not_a_number_is_not_drawn():
     image = draw(inputs, degree=0)[0]
     assert torch.equal(image, whole)
     image.sum().backward()
-    assert all(x.grad[:30].isfinite().all() for x in inputs[:4])
+    assert all(x.grad.isfinite().all() for x in inputs)
 
 
 def test_gradcheck_in_double_precision():
