@@ -9,14 +9,15 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from benchmarks.methods.gaussians.arrays import array
-from benchmarks.methods.gaussians.blend_numba import (
-    FEATURES,
-    MEAN,
-    OPACITY,
-    SHAPE,
-    add_slots,
-    blend,
-    blend_backward,
+from benchmarks.methods.gaussians.blend_backward_numba import blend_backward
+from benchmarks.methods.gaussians.blend_numba import blend
+from benchmarks.methods.gaussians.packed_numba import (
+    CHANNELS,
+    COLUMNS,
+    MOMENTS,
+    REACH,
+    pack,
+    unpack,
 )
 from benchmarks.methods.gaussians.projection import Ellipses
 from benchmarks.methods.gaussians.tiles_numba import sort_into_tiles
@@ -36,16 +37,13 @@ def blend_ellipses(
     T would fall to 10⁻⁴ (Kerbl et al. 2023, §6 and appendix C). The order by depth and the radii
     have no gradient.
     """
-    return _Blend.apply(
-        ellipses.means,
-        ellipses.shapes,
-        opacities,
-        features,
-        background,
-        ellipses.radii,
-        ellipses.depths,
-        (height, width),
-    )
+    geometry = (ellipses.means, ellipses.shapes, opacities)
+    sorting = (ellipses.radii, ellipses.depths, (height, width))
+    images = []
+    for some, behind in zip(features.split(CHANNELS, 1), background.split(CHANNELS), strict=True):
+        image, transmittance = _Blend.apply(*geometry, some, behind, *sorting)
+        images.append(image)
+    return torch.cat(images, -1) if len(images) > 1 else images[0], transmittance
 
 
 class _Blend(torch.autograd.Function):
@@ -61,16 +59,17 @@ class _Blend(torch.autograd.Function):
         depths: Tensor,
         size: tuple[int, int],
     ) -> tuple[Tensor, Tensor]:
-        inputs = [array(x) for x in (means, shapes, opacities, features, background)]
         height, width = size
-        tiles = sort_into_tiles(inputs[0], array(radii), array(depths), width, height)
+        packed = array(means.new_empty(len(means), COLUMNS))
+        pack(*(array(x) for x in (means, shapes, opacities, features, radii)), packed)
+        reaches = packed[:, REACH : REACH + 2]
+        tiles = sort_into_tiles(array(means), reaches, array(depths), width, height)
         image = means.new_empty(height, width, features.shape[1])
-        transmittance = means.new_empty(height, width)
-        ends = np.empty(size, np.int64)
-        out = (image.numpy(), transmittance.numpy(), ends)
-        blend(*inputs, tiles.starts, tiles.gaussians, *out)
-        ctx.save_for_backward(means, shapes, opacities, features, background, transmittance)
-        ctx.tiles, ctx.ends = tiles, ends
+        transmittance, ends = means.new_empty(size), np.empty(size, np.int32)
+        out = (array(image), array(transmittance), ends)
+        blend(packed, array(background), tiles.starts, tiles.gaussians, *out)
+        ctx.save_for_backward(shapes, opacities, background, transmittance)
+        ctx.packed, ctx.tiles, ctx.ends = packed, tiles, ends
         return image, transmittance
 
     @staticmethod
@@ -78,31 +77,24 @@ class _Blend(torch.autograd.Function):
     def backward(
         ctx: Any, image_grad: Tensor, transmittance_grad: Tensor
     ) -> tuple[Tensor | None, ...]:
-        *inputs, transmittance = (array(x) for x in ctx.saved_tensors)
-        tiles, features = ctx.tiles, inputs[3]
-        columns = FEATURES + features.shape[1]
-        slot_grads = np.zeros((len(tiles.slots), columns), features.dtype)
-        grads = image_grad.new_empty(len(features), columns)
+        shapes, opacities, background, transmittance = ctx.saved_tensors
+        tiles, packed = ctx.tiles, ctx.packed
+        moments = np.empty((len(tiles.slots), MOMENTS), packed.dtype)
         blend_backward(
-            *inputs,
+            packed,
+            array(background),
             tiles.starts,
             tiles.gaussians,
             tiles.slots,
-            transmittance,
+            array(transmittance),
             ctx.ends,
             array(image_grad),
             array(transmittance_grad),
-            slot_grads,
+            moments,
         )
-        add_slots(tiles.slot_starts, slot_grads, grads.numpy())
-        background_grad = torch.einsum("hwd,hw->d", image_grad, torch.from_numpy(transmittance))
-        return (
-            grads[:, MEAN:SHAPE],
-            grads[:, SHAPE:OPACITY],
-            grads[:, OPACITY],
-            grads[:, FEATURES:],
-            background_grad,
-            None,
-            None,
-            None,
-        )
+        n, channels = len(shapes), image_grad.shape[-1]
+        grads = [shapes.new_empty(extent) for extent in ((n, 2), (n, 3), (n,), (n, channels))]
+        gradients = (array(x) for x in grads)
+        unpack(tiles.slot_starts, moments, array(shapes), array(opacities), *gradients)
+        background_grad = torch.einsum("hwd,hw->d", image_grad, transmittance)
+        return *grads, background_grad, None, None, None

@@ -1,44 +1,47 @@
-"""Blending sorted ellipses tile by tile, and its derivative: compiled loops, parallel over tiles.
-
-The backward pass walks each tile's Gaussians back to front. What it finds goes to a slot of its own
-for each meeting of a Gaussian with a tile, and the slots of a Gaussian are then added in a fixed
-order: nothing is added by two threads, so the same bits come out on any number of them.
-"""
-
-import math
+"""Blending sorted ellipses tile by tile: compiled loops, parallel over tiles."""
 
 import numba
 import numpy as np
 
+from benchmarks.methods.gaussians.block_numba import (
+    ACROSS,
+    BLOCKS,
+    COLORS,
+    END,
+    LANES,
+    LEFT,
+    LIGHT,
+    MOST_ALPHA,
+    ONE,
+    PIXELS,
+    PLANES,
+    SIDE,
+    SIDE_BITS,
+    ZERO,
+    alpha_of,
+    pixel_of,
+    place,
+    sum_of,
+)
+from benchmarks.methods.gaussians.packed_numba import (
+    FEATURES,
+    LOG_OPACITY,
+    PRECISION,
+    PRECISION_V,
+    SLOPE,
+)
 from benchmarks.methods.gaussians.tiles_numba import TILE
 from extrap_train.geometry.compiled import compiled
 
-MOST_ALPHA = 0.999
-LEAST_TRANSMITTANCE = 1e-4
-"""A pixel is full when the next Gaussian would leave less light than this."""
-_LEAST_ALPHA = 1 / 255
-MEAN, SHAPE, OPACITY, FEATURES = 0, 2, 5, 6
-"""Where the gradients lie in a slot."""
+_CHECK_EVERY = 16
+"""Meetings after which to look which blocks are full."""
+_LEAST_LIGHT = np.float32(1e-4)
+"""A pixel is full when the next ellipse would leave less light than this."""
 
 
-@compiled()
-def _alpha(
-    mean: np.ndarray, shape: np.ndarray, opacity: float, x: int, y: int
-) -> tuple[float, float, float]:
-    """Unclamped alpha at a pixel's centre, and the centre's offset: along x from the centre line,
-    and along y."""
-    down = y + 0.5 - mean[1]
-    across = x + 0.5 - mean[0] - shape[1] * down
-    exponent = 0.5 * (shape[0] * across * across + shape[2] * down * down)
-    return opacity * math.exp(-exponent), across, down
-
-
-@compiled(parallel=True)
+@compiled(parallel=True, contract=True)
 def blend(
-    means: np.ndarray,
-    shapes: np.ndarray,
-    opacities: np.ndarray,
-    features: np.ndarray,
+    packed: np.ndarray,
     background: np.ndarray,
     starts: np.ndarray,
     gaussians: np.ndarray,
@@ -46,97 +49,80 @@ def blend(
     transmittance: np.ndarray,
     ends: np.ndarray,
 ) -> None:
-    """Blend front to back: `image` (h w d), what light is left, and one past the last meeting."""
-    height, width, channels = image.shape
-    columns = -(-width // TILE)
+    """Fill the last three: up to four channels (h w d), the light that is left, and the number of
+    the tile's last meeting that counts, from 1."""
+    columns = -(-image.shape[1] // TILE)
     for tile in numba.prange(len(starts) - 1):
         top, left = tile // columns * TILE, tile % columns * TILE
-        for y in range(top, min(top + TILE, height)):
-            for x in range(left, min(left + TILE, width)):
-                image[y, x] = 0
-                light = means.dtype.type(1)
-                end = starts[tile]
-                for m in range(starts[tile], starts[tile + 1]):
-                    i = gaussians[m]
-                    alpha, _, _ = _alpha(means[i], shapes[i], opacities[i], x, y)
-                    alpha = min(alpha, MOST_ALPHA)
-                    if alpha < _LEAST_ALPHA:
-                        continue
-                    if light * (1 - alpha) <= LEAST_TRANSMITTANCE:
-                        break
-                    for c in range(channels):
-                        image[y, x, c] += features[i, c] * (alpha * light)
-                    light *= 1 - alpha
-                    end = m + 1
-                for c in range(channels):
-                    image[y, x, c] += light * background[c]
-                transmittance[y, x], ends[y, x] = light, end
+        planes = np.zeros(PLANES * PIXELS, packed.dtype)
+        for y in range(min(TILE, len(image) - top)):
+            for x in range(min(TILE, image.shape[1] - left)):
+                pixel = pixel_of(y, x)
+                planes[LIGHT + pixel] = planes[LEFT + pixel] = ONE
+        _blend_tile(packed, gaussians[starts[tile] : starts[tile + 1]], top, left, planes)
+        for y in range(min(TILE, len(image) - top)):
+            for x in range(min(TILE, image.shape[1] - left)):
+                pixel = pixel_of(y, x)
+                light = planes[LEFT + pixel]
+                transmittance[top + y, left + x] = light
+                ends[top + y, left + x] = np.int32(planes[END + pixel])
+                for c in range(image.shape[2]):
+                    color = planes[COLORS + c * PIXELS + pixel]
+                    image[top + y, left + x, c] = color + light * background[c]
 
 
-@compiled(parallel=True)
-def blend_backward(
-    means: np.ndarray,
-    shapes: np.ndarray,
-    opacities: np.ndarray,
-    features: np.ndarray,
-    background: np.ndarray,
-    starts: np.ndarray,
-    gaussians: np.ndarray,
-    slots: np.ndarray,
-    transmittance: np.ndarray,
-    ends: np.ndarray,
-    image_grad: np.ndarray,
-    transmittance_grad: np.ndarray,
-    slot_grads: np.ndarray,
+@compiled(contract=True)
+def _blend_tile(
+    packed: np.ndarray, gaussians: np.ndarray, top: int, left: int, planes: np.ndarray
 ) -> None:
-    """Write the gradient of each meeting to its slot (zeros before)."""
-    height, width, channels = image_grad.shape
-    columns = -(-width // TILE)
-    for tile in numba.prange(len(starts) - 1):
-        top, left = tile // columns * TILE, tile % columns * TILE
-        for y in range(top, min(top + TILE, height)):
-            for x in range(left, min(left + TILE, width)):
-                light = transmittance[y, x]
-                behind = transmittance_grad[y, x] * light
-                for c in range(channels):
-                    behind += background[c] * image_grad[y, x, c] * light
-                for m in range(ends[y, x] - 1, starts[tile] - 1, -1):
-                    i = gaussians[m]
-                    free_alpha, across, down = _alpha(means[i], shapes[i], opacities[i], x, y)
-                    alpha = min(free_alpha, MOST_ALPHA)
-                    if alpha < _LEAST_ALPHA:
-                        continue
-                    light /= 1 - alpha
-                    out = slot_grads[slots[m]]
-                    value = means.dtype.type(0)
-                    for c in range(channels):
-                        value += features[i, c] * image_grad[y, x, c]
-                        out[FEATURES + c] += alpha * light * image_grad[y, x, c]
-                    alpha_grad = light * value - behind / (1 - alpha)
-                    behind += alpha * light * value
-                    if free_alpha <= MOST_ALPHA:
-                        _add_geometry(shapes[i], across, down, alpha * alpha_grad, out)
-                        out[OPACITY] += alpha / opacities[i] * alpha_grad
+    alive = np.ones(BLOCKS, np.bool_)
+    for k in range(len(gaussians)):
+        ellipse = packed[gaussians[k]]
+        u, v, (first, last, top_row, bottom_row) = place(ellipse, top, left)
+        for row in range(top_row, bottom_row):
+            for column in range(first, last):
+                block = row * ACROSS + column
+                if alive[block]:
+                    center = (u - column * SIDE, v - row * SIDE)
+                    _blend_block(planes[block * LANES :], ellipse, center, k + 1)
+        if k % _CHECK_EVERY == _CHECK_EVERY - 1 and not _find_alive(planes, alive):
+            return
+
+
+@compiled(contract=True)
+def _blend_block(
+    pixels: np.ndarray, ellipse: np.ndarray, center: tuple[float, float], meeting: int
+) -> None:
+    """Blend an ellipse, whose mean is given from the block's first pixel on, into the block."""
+    u, v, number = pixels.dtype.type(center[0]), pixels.dtype.type(center[1]), np.float32(meeting)
+    precision, slope = ellipse[PRECISION], ellipse[SLOPE]
+    precision_v, log = ellipse[PRECISION_V], ellipse[LOG_OPACITY]
+    first, second = ellipse[FEATURES], ellipse[FEATURES + 1]
+    third, fourth = ellipse[FEATURES + 2], ellipse[FEATURES + 3]
+    for j in range(LANES):
+        down = np.float32(j >> SIDE_BITS) - v
+        apart = np.float32(j & (SIDE - 1)) - u - slope * down
+        free = alpha_of(log - precision_v * (down * down) - precision * (apart * apart))
+        alpha = min(free, MOST_ALPHA)
+        light = pixels[LIGHT + j]
+        after = light * (ONE - alpha)
+        full = after <= _LEAST_LIGHT
+        weight = ZERO if full else alpha * light
+        pixels[LIGHT + j] = ZERO if full else after
+        pixels[LEFT + j] = pixels[LEFT + j] if full else after
+        pixels[END + j] = number if weight > ZERO else pixels[END + j]
+        pixels[COLORS + j] += weight * first
+        pixels[COLORS + PIXELS + j] += weight * second
+        pixels[COLORS + 2 * PIXELS + j] += weight * third
+        pixels[COLORS + 3 * PIXELS + j] += weight * fourth
 
 
 @compiled()
-def _add_geometry(
-    shape: np.ndarray, across: float, down: float, log_grad: float, out: np.ndarray
-) -> None:
-    """Chain the gradient to log(alpha) on to mean and shape."""
-    pull = shape[0] * across * log_grad
-    out[MEAN] += pull
-    out[MEAN + 1] += shape[2] * down * log_grad - shape[1] * pull
-    out[SHAPE] -= 0.5 * across * across * log_grad
-    out[SHAPE + 1] += pull * down
-    out[SHAPE + 2] -= 0.5 * down * down * log_grad
-
-
-@compiled(parallel=True)
-def add_slots(slot_starts: np.ndarray, slot_grads: np.ndarray, grads: np.ndarray) -> None:
-    """Add each Gaussian's slots, in order."""
-    for i in numba.prange(len(grads)):
-        grads[i] = 0
-        for slot in range(slot_starts[i], slot_starts[i + 1]):
-            for c in range(grads.shape[1]):
-                grads[i, c] += slot_grads[slot, c]
+def _find_alive(planes: np.ndarray, alive: np.ndarray) -> bool:
+    """Mark the blocks that any light passes through, and say whether there are any."""
+    some = False
+    for block in range(len(alive)):
+        light = sum_of(planes[LIGHT + block * LANES :])
+        alive[block] = light > ZERO
+        some = some or light > ZERO
+    return some

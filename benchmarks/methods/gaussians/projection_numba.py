@@ -97,14 +97,9 @@ def project_backward(
             point_grad[0] += along_u
             point_grad[1] += along_v
             point_grad[2] += depths_grad[i] - (along_u * x + along_v * y) / z
+            pose_grad = pose_grads[block]
             _axes_backward(
-                world_to_cam,
-                turn,
-                scales[i],
-                axes_grad,
-                turn_grad,
-                scales_grad[i],
-                pose_grads[block],
+                world_to_cam, turn, scales[i], axes_grad, turn_grad, scales_grad[i], pose_grad
             )
             _turn_backward(quats[i], turn_grad, quats_grad[i])
             for column in range(3):
