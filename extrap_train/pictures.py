@@ -1,8 +1,10 @@
 """Contact sheets: what a person looks at beside the numbers."""
 
 import io
+import os
 from pathlib import Path
 
+import cv2
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
@@ -11,6 +13,8 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from extrap_train.data.files import write_whole
+from extrap_train.data.images import to_eight_bits
+from extrap_train.errors import InputError
 
 _HOLE_COLOUR = (1.0, 0.0, 1.0)
 _LEAST_TILE_PIXELS = 128
@@ -86,3 +90,50 @@ def curve(steps: list[int], series: dict[str, list[float]], label: str, path: Pa
     figure.savefig(content, format="png", dpi=100)
     plt.close(figure)
     write_whole(path, content.getvalue())
+
+
+def picture(image: Float[Tensor, "3 h w"], path: Path) -> None:
+    """One picture, pixel by pixel, written as PNG."""
+    content = io.BytesIO()
+    Image.fromarray(to_eight_bits(image).transpose(1, 2, 0)).save(content, "png")
+    write_whole(path, content.getvalue())
+
+
+def film(images: Float[Tensor, "n 3 h w"], path: Path, frames_per_second: int = 12) -> None:
+    """Pictures one after the other, enlarged to be seen, written as GIF or MP4 by the name's end.
+
+    The MP4 holds VP9, which browsers and players read; a GIF repeats for ever.
+    """
+    frames = _enlarged(to_eight_bits(images).transpose(0, 2, 3, 1))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{os.getpid()}.{path.name}")
+    try:
+        if path.suffix == ".gif":
+            pictures = [Image.fromarray(frame) for frame in frames]
+            pause_ms, rest = round(1000 / frames_per_second), pictures[1:]
+            pictures[0].save(
+                temporary, save_all=True, append_images=rest, duration=pause_ms, loop=0
+            )
+        else:
+            _write_mp4(frames, temporary, frames_per_second)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _enlarged(pixels: np.ndarray) -> np.ndarray:
+    """By whole numbers, to at least a tile's size, with even sides, which video needs."""
+    scale = max(1, round(_LEAST_TILE_PIXELS / pixels.shape[2]))
+    large = pixels.repeat(scale, 1).repeat(scale, 2)
+    return np.ascontiguousarray(large[:, : large.shape[1] // 2 * 2, : large.shape[2] // 2 * 2])
+
+
+def _write_mp4(frames: np.ndarray, path: Path, frames_per_second: int) -> None:
+    height, width = frames.shape[1:3]
+    codec = cv2.VideoWriter.fourcc(*"vp09")
+    writer = cv2.VideoWriter(str(path), codec, frames_per_second, (width, height))
+    if not writer.isOpened():
+        raise InputError(f"{path}: this OpenCV cannot write VP9 video; write a .gif instead")
+    for frame in frames:
+        writer.write(frame[..., ::-1])
+    writer.release()

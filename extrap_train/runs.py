@@ -5,7 +5,7 @@ import json
 import os
 import platform
 import shutil
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from typing import Any
 import torch
 import yaml
 
-from extrap_train.config import SyntheticConfig, TrainConfig, dotted
+from extrap_train.config import SceneOptions, SyntheticConfig, TrainConfig, dotted
 from extrap_train.data.files import write_whole
 from extrap_train.errors import InputError
 
@@ -24,8 +24,11 @@ _NOT_PART_OF_THE_RUN = (
     "threads",
     "validation",
     "trainer.steps",
+    *(field.name for field in fields(SceneOptions)),
 )
-"""May differ on resume: where things lie, how they are measured, how long is trained."""
+"""May differ on resume: where things lie, how they are measured, how long is trained, and what
+other tasks read.
+"""
 
 _LATEST = "latest"
 """Link to the newest run of a model and category."""

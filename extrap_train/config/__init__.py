@@ -41,6 +41,7 @@ from extrap_train.config.model import (
     UNetConfig,
     VaeConfig,
 )
+from extrap_train.config.scene import LoraConfig, SceneOptions
 from extrap_train.config.training import TrainerConfig, ValidationConfig
 from extrap_train.config.tree import MISSING, dotted
 
@@ -65,6 +66,7 @@ __all__ = [
     "LauncherConfig",
     "LocalConfig",
     "LoftrMatcherConfig",
+    "LoraConfig",
     "Mast3rConfig",
     "MatcherConfig",
     "MethodConfig",
@@ -74,6 +76,7 @@ __all__ = [
     "RulesConfig",
     "SamplerConfig",
     "ScoringConfig",
+    "SceneOptions",
     "SlurmConfig",
     "StereoConfig",
     "SyntheticConfig",

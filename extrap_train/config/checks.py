@@ -6,7 +6,7 @@ from typing import Any
 
 from extrap_train.config.commands import DataPrepConfig, TrainConfig
 from extrap_train.config.data import Co3dConfig, PrepConfig
-from extrap_train.config.model import FAMILIES, ModelConfig
+from extrap_train.config.model import FAMILIES, ModelConfig, SamplerConfig
 from extrap_train.config.tree import dotted
 from extrap_train.errors import InputError
 
@@ -46,8 +46,19 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "model.clip.layers": (1, 64),
     "model.clip.heads": (1, 64),
     "model.clip.embedding_width": (1, 8192),
+    "inputs": (1, 10_000),
+    "minutes": (0.001, 10_000),
+    "orbit": (1, 360),
+    "frames": (1, 10_000),
+    "lora.rank": (1, 1024),
+    "lora.batch_size": (1, math.inf),
+    "lora.steps": (1, math.inf),
+    "lora.validate_every": (1, math.inf),
+    "lora.patience": (1, math.inf),
     "sampler.steps": (1, 1000),
     "sampler.eta": (0, 1),
+    "sampler.guidance_far_deg": (1, 180),
+    "sampler.guidance_rescale": (0, 1),
     "trainer.steps": (1, math.inf),
     "trainer.batch_size": (1, math.inf),
     "trainer.warmup_steps": (0, math.inf),
@@ -79,8 +90,7 @@ def validate(config: TrainConfig | DataPrepConfig, tasks: tuple[str, ...]) -> No
         _check_one_of("task", config.task, tasks)
         _check_one_of("trainer.precision", config.trainer.precision, _PRECISIONS)
         _check_model(config.model, config.prep)
-        if config.sampler.compat is not None:
-            _check_one_of("sampler.compat", config.sampler.compat, ("megascenes",))
+        _check_sampler(config.sampler)
 
 
 def required_file(path: str | None, option: str, content: str) -> str:
@@ -139,6 +149,23 @@ def _check_model(model: ModelConfig, prep: PrepConfig) -> None:
         raise InputError(
             "model.prediction=epsilon says nothing at zero terminal SNR: "
             "give model.zero_terminal_snr=false"
+        )
+
+
+def _check_sampler(sampler: SamplerConfig) -> None:
+    _check_one_of("sampler.solver", sampler.solver, ("ddim", "dpmpp", "unipc"))
+    if sampler.compat is not None:
+        _check_one_of("sampler.compat", sampler.compat, ("megascenes",))
+    if sampler.solver != "ddim" and (sampler.eta > 0 or sampler.compat):
+        raise InputError(
+            f"sampler.solver={sampler.solver} is deterministic and none of the published runs: "
+            "sampler.eta and sampler.compat need sampler.solver=ddim"
+        )
+    interval = sampler.guidance_interval
+    if len(interval) != 2 or not 0 <= interval[0] <= interval[1] <= 1:
+        raise InputError(
+            f"sampler.guidance_interval={interval}: need [lowest,highest] with "
+            "0 ≤ lowest ≤ highest ≤ 1"
         )
 
 

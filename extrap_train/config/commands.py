@@ -7,12 +7,13 @@ from extrap_train.config.depth import DepthConfig
 from extrap_train.config.launcher import LauncherConfig
 from extrap_train.config.matching import MatcherConfig
 from extrap_train.config.model import ModelConfig, SamplerConfig
+from extrap_train.config.scene import SceneOptions
 from extrap_train.config.training import TrainerConfig, ValidationConfig
 from extrap_train.config.tree import MISSING
 
 
 @dataclass
-class TrainConfig:
+class TrainConfig(SceneOptions):
     """The whole tree of `python -m extrap_train`."""
 
     category: CategoryConfig = MISSING

@@ -74,12 +74,23 @@ class ModelConfig:
 
 @dataclass
 class SamplerConfig:
-    """How a view is sampled (DDIM)."""
+    """How a view is sampled."""
 
+    solver: str = "ddim"
+    """`ddim` (paper), or of second order, for few steps: `dpmpp` (DPM-Solver++ 2M), `unipc`."""
     steps: int = 2
     eta: float = 0.0
+    """Share of DDIM's noise that is drawn anew at every step; 0 is deterministic."""
     guidance: float = 1.0
     """Weight of the conditional prediction against the null condition's; 1 is no guidance."""
+    guidance_far: float | None = None
+    """Weight far from the inputs, to which `guidance` grows with the angle; null keeps it."""
+    guidance_far_deg: float = 90.0
+    """Angle between query and nearest reference from which on `guidance_far` holds."""
+    guidance_interval: list[float] = field(default_factory=lambda: [0.0, 1.0])
+    """Shares of the noise schedule, 0 clean to 1 pure noise, between which guidance acts."""
+    guidance_rescale: float = 0.0
+    """How far guidance's wider spread is taken back (Lin et al. 2023); they use 0.7."""
     compat: str | None = None
     """`megascenes` samples as ZeroNVS and MegaScenes were published: guidance against plain zeros,
     which their training never saw, and the noisiest step left out.

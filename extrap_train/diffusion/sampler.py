@@ -1,9 +1,8 @@
-"""Sampling a view: DDIM with classifier-free guidance, one generator per view."""
+"""Sampling views: any solver with classifier-free guidance, one generator per view."""
 
-import copy
 import zlib
 from collections.abc import Sequence
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from diffusers import DDIMScheduler
@@ -12,6 +11,8 @@ from torch import Tensor
 
 from extrap_train.config import SamplerConfig
 from extrap_train.diffusion.conditioning import Conditioning
+from extrap_train.diffusion.guidance import acts, guidance_weights, guided
+from extrap_train.diffusion.schedule import solver_of
 from extrap_train.views import PairBatch
 
 
@@ -61,18 +62,32 @@ def sample_views(
     Noise is drawn on the CPU, one generator a view, so that the device does not change the picture.
     """
     conditioning = model.condition(batch)
-    schedule = copy.deepcopy(model.schedule)
-    schedule.set_timesteps(config.steps)
-    published = config.compat == "megascenes"
+    weights = guidance_weights(batch, config)
+    solver = solver_of(model.schedule, config)
+    levels = solver.config["num_train_timesteps"] - 1
     latent = _noise(conditioning.base, generators)
-    for timestep in schedule.timesteps[1:] if published else schedule.timesteps:
+    for timestep in solver.timesteps[1:] if config.compat == "megascenes" else solver.timesteps:
         steps = torch.full((len(latent),), int(timestep), device=latent.device)
-        prediction = _guided(model, latent, steps, conditioning, config)
-        noise = _noise(latent, generators) if config.eta > 0 else None
-        latent = schedule.step(
-            prediction, timestep, latent, eta=config.eta, variance_noise=noise
-        ).prev_sample
+        if acts(int(timestep) / levels, config) and not (weights == 1).all():
+            prediction = _guided(model, latent, steps, conditioning, weights, config)
+        else:
+            prediction = model(latent, steps, conditioning)
+        latent = _stepped(solver, prediction, timestep, latent, config.eta, generators)
     return model.decode_target(latent, conditioning)
+
+
+def _stepped(
+    solver: Any,
+    prediction: Float[Tensor, "b z h w"],
+    timestep: Int[Tensor, ""],
+    latent: Float[Tensor, "b z h w"],
+    eta: float,
+    generators: Sequence[torch.Generator],
+) -> Float[Tensor, "b z h w"]:
+    if not isinstance(solver, DDIMScheduler):
+        return solver.step(prediction, timestep, latent).prev_sample
+    noise = _noise(latent, generators) if eta > 0 else None
+    return solver.step(prediction, timestep, latent, eta=eta, variance_noise=noise).prev_sample
 
 
 def _noise(
@@ -86,11 +101,10 @@ def _guided(
     latent: Float[Tensor, "b z h w"],
     timestep: Int[Tensor, " b"],
     conditioning: Conditioning,
+    weights: Float[Tensor, " b"],
     config: SamplerConfig,
 ) -> Float[Tensor, "b z h w"]:
-    if config.guidance == 1:
-        return model(latent, timestep, conditioning)
     doubled = conditioning.doubled(plain_zeros=config.compat == "megascenes")
     both = model(torch.cat([latent, latent]), torch.cat([timestep, timestep]), doubled)
     conditional, null = both.chunk(2)
-    return null + config.guidance * (conditional - null)
+    return guided(conditional, null, weights, config.guidance_rescale)

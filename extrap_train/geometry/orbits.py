@@ -1,0 +1,63 @@
+"""Cameras on a circle around what a few views look at."""
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from extrap_train.geometry.viewpoints import camera_centers, directions_from, fit_orbit
+from extrap_train.views import Camera
+
+LEAST_VIEWS = 3
+"""Fewer do not say which way their orbit leans."""
+
+
+def orbit_cameras(views: Camera, span_rad: float, count: int) -> Camera:
+    """`count` cameras in equal steps of `span_rad / count` from the first view's azimuth on.
+
+    They stand at the views' median elevation and distance, look at the point that these look at
+    with the orbit's axis up, and have their median focal length around the image's middle. A full
+    turn does not repeat its first camera. Raises ValueError for fewer than three views.
+    """
+    if len(views.world_to_cam) < LEAST_VIEWS:
+        raise ValueError(f"an orbit needs {LEAST_VIEWS} views, not {len(views.world_to_cam)}")
+    orbit = fit_orbit(views)
+    first = directions_from(views[:1], orbit.center)[0]
+    east = first - (first @ orbit.axis) * orbit.axis
+    east /= np.linalg.norm(east)
+    azimuths = span_rad / count * np.arange(count)[:, None]
+    level = np.cos(azimuths) * east + np.sin(azimuths) * np.cross(orbit.axis, east)
+    elevation = np.median(orbit.elevations_rad)
+    distance = np.median(np.linalg.norm(camera_centers(views) - orbit.center, axis=1))
+    out = np.cos(elevation) * level + np.sin(elevation) * orbit.axis
+    matrices = looking_at(orbit.center + distance * out, orbit.center, orbit.axis)
+    return Camera(
+        torch.from_numpy(matrices).to(views.world_to_cam.dtype),
+        _central_lens(views).expand(count, 3, 3).clone(),
+        views.height,
+        views.width,
+    )
+
+
+def looking_at(
+    positions: Float[np.ndarray, "n 3"],
+    target: Float[np.ndarray, "3"],
+    up: Float[np.ndarray, "3"],
+) -> Float[np.ndarray, "n 4 4"]:
+    """`world_to_cam` of cameras that look at a point, with `up` upwards in their images."""
+    forward = target - positions
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    rotation = np.stack([right, np.cross(forward, right), forward], 1)
+    matrices = np.tile(np.eye(4), (len(positions), 1, 1))
+    matrices[:, :3, :3] = rotation
+    matrices[:, :3, 3] = -np.einsum("nij,nj->ni", rotation, positions)
+    return matrices
+
+
+def _central_lens(views: Camera) -> Float[torch.Tensor, "3 3"]:
+    focal = views.intrinsics.diagonal(dim1=-2, dim2=-1)[:, :2].median(0).values
+    lens = torch.eye(3, dtype=focal.dtype)
+    lens[0, 0], lens[1, 1] = focal
+    lens[0, 2], lens[1, 2] = views.width / 2, views.height / 2
+    return lens

@@ -1,0 +1,34 @@
+"""Cameras between the views of a circle are those of the circle."""
+
+import numpy as np
+import pytest
+import torch
+from orbits import even, ring
+
+from extrap_train.geometry.orbits import orbit_cameras
+from extrap_train.geometry.viewpoints import camera_centers
+
+
+@pytest.mark.parametrize("inputs", [[0, 1, 2], [0, 4, 8], [3, 5, 9, 10]])
+def test_a_full_turn_goes_through_the_views_that_it_was_fitted_to(inputs):
+    views = ring(even(12))
+    made = orbit_cameras(views[torch.tensor(inputs)], 2 * np.pi, 12)
+    order = [inputs[0] + step for step in range(12)]
+    if np.linalg.norm(camera_centers(made)[1] - camera_centers(views)[(inputs[0] + 1) % 12]) > 1:
+        order = [inputs[0] - step for step in range(12)]
+    expected = views[torch.tensor([i % 12 for i in order])]
+    torch.testing.assert_close(made.world_to_cam, expected.world_to_cam, atol=1e-4, rtol=0)
+    torch.testing.assert_close(made.intrinsics, expected.intrinsics)
+
+
+def test_a_part_of_a_turn_starts_at_the_first_view_and_keeps_its_distance():
+    views = ring(np.array([10.0, 50.0, 90.0]), elevation_deg=35)
+    made = orbit_cameras(views, np.pi / 2, 3)
+    torch.testing.assert_close(made.world_to_cam[0], views.world_to_cam[0], atol=1e-4, rtol=0)
+    distance = np.linalg.norm(camera_centers(made) - [0.5, -0.2, 0.1], axis=1)
+    np.testing.assert_allclose(distance, 3.0, rtol=1e-5)
+
+
+def test_two_views_are_no_orbit():
+    with pytest.raises(ValueError, match="an orbit needs 3 views, not 2"):
+        orbit_cameras(ring(even(4))[:2], np.pi, 3)
