@@ -92,3 +92,18 @@ def squeeze_lpips(
         return values.flatten()
 
     return distance
+
+
+def lpips_or_reason(
+    weights: str | None,
+) -> tuple[
+    Callable[[Float[Tensor, "b 3 h w"], Float[Tensor, "b 3 h w"]], Float[Tensor, " b"]] | None,
+    dict[str, str],
+]:
+    """LPIPS (squeeze), or None and why; weights that are given and cannot be used are an error."""
+    try:
+        return squeeze_lpips(weights), {}
+    except InputError as error:
+        if weights is not None:
+            raise
+        return None, {"lpips": str(error)}

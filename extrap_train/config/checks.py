@@ -64,6 +64,7 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "trainer.warmup_steps": (0, math.inf),
     "trainer.full_rate_steps": (1, math.inf),
     "trainer.condition_dropout": (0, 1),
+    "trainer.min_snr": (0.01, 1e6),
     "trainer.ema_decay": (0, 1),
     "trainer.devices": (1, math.inf),
     "trainer.checkpoint_every": (1, math.inf),

@@ -16,6 +16,10 @@ class TrainerConfig:
     """
     condition_dropout: float = 0.05
     """Share of the training examples whose condition is the null condition."""
+    min_snr: float | None = None
+    """Greatest weight of a noise level by its signal-to-noise ratio (Hang et al. 2023: 5); null
+    weighs all alike.
+    """
     ema_decay: float = 0.999
     precision: str = "bf16-mixed"
     accelerator: str = "auto"

@@ -111,7 +111,7 @@ def sequence_of_photographs(
         raise InputError(f"{description}: lists a picture twice; remove the second entry")
     frames = []
     for photo, frame_name in zip(ordered, _frame_names(paths), strict=True):
-        pinhole, camera = _pinhole_camera(photo, description)
+        pinhole, camera = pinhole_camera(photo, description)
         frames.append(
             Frame(
                 name=frame_name,
@@ -132,7 +132,8 @@ def _frame_names(paths: list[str]) -> list[str]:
     return ["_".join(Path(path).parts) for path in paths]
 
 
-def _pinhole_camera(photo: Photograph, description: Path) -> tuple[Lens, Camera]:
+def pinhole_camera(photo: Photograph, description: Path) -> tuple[Lens, Camera]:
+    """The camera of a photograph once its lens is undone; InputError where it is degenerate."""
     if not all(np.isfinite([*photo.lens.matrix.flat, *photo.lens.distortion])):
         raise InputError(f"{description}: the lens of {photo.image_path} is not finite; correct it")
     try:

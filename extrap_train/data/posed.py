@@ -11,13 +11,19 @@ from torch import Tensor
 
 from extrap_train.data.files import check_relative, read_json
 from extrap_train.data.images import image_size
-from extrap_train.data.photographs import Photograph, present_pictures, sequence_of_photographs
+from extrap_train.data.photographs import (
+    Photograph,
+    pinhole_camera,
+    present_pictures,
+    sequence_of_photographs,
+)
 from extrap_train.data.sequences import Sequence
 from extrap_train.data.validation import require_dict, require_list
 from extrap_train.errors import InputError
 from extrap_train.geometry.colmap import CAMERA_MODELS, lens_from_parameters
 from extrap_train.geometry.lens import Lens
 from extrap_train.geometry.opengl import world_to_cam_from_opengl
+from extrap_train.views import Camera, stack_cameras
 
 TRANSFORMS = "transforms.json"
 MILLIMETRES = 0.001
@@ -51,6 +57,28 @@ def read_transforms(folder: Path) -> Sequence:
         file,
         point_cloud=folder / check_relative(str(cloud), file) if cloud else None,
     )
+
+
+def read_cameras(file: Path) -> tuple[list[str], Camera]:
+    """Names and pinhole cameras of a file laid out like `transforms.json` that has no pictures.
+
+    Every entry needs a `transform_matrix` and, itself or for all, the size `w`, `h` and a lens. All
+    entries must have one size. Raises InputError that names the entry otherwise.
+    """
+    content = require_dict(read_json(file), "an object with a list `frames`", file)
+    entries = require_list(content.get("frames"), "frames", file)
+    names, cameras = [], []
+    for index, entry in enumerate(entries):
+        entry = content | require_dict(entry, f"an object as frame {index}", file)
+        name = str(entry.get("file_path", f"{index:03d}"))
+        if "w" not in entry or "h" not in entry:
+            raise InputError(f"{file}: neither the file nor its entry {name} has w and h; add them")
+        names.append(name)
+        cameras.append(pinhole_camera(_photograph(file.parent, name, entry, file), file)[1])
+    sizes = {(camera.height, camera.width) for camera in cameras}
+    if len(sizes) != 1:
+        raise InputError(f"{file}: its entries have different sizes {sorted(sizes)}; split it")
+    return names, stack_cameras(cameras)
 
 
 def _picture_path(folder: Path, entry: Any, index: int, file: Path) -> str:

@@ -55,17 +55,29 @@ def predict(
 
 
 def score(prediction: Prediction, lpips: Distance | None) -> pd.DataFrame:
+    """A row per view and method of a batch, see `score_images`."""
+    assert prediction.batch.warp is not None
+    known = prediction.batch.warp.mask
+    return score_images(prediction.images, prediction.batch.image, known, prediction.names, lpips)
+
+
+def score_images(
+    images: dict[str, Float[Tensor, "b 3 h w"]],
+    truth: Float[Tensor, "b 3 h w"],
+    known: Float[Tensor, "b h w"],
+    names: list[str],
+    lpips: Distance | None,
+) -> pd.DataFrame:
     """A row per view and method: psnr, psnr_holes, psnr_warped (dB), ssim, and lpips where it can
     be had.
 
-    Images and truth go through 8 bits first. `psnr_holes` is over the pixels that no reference
-    reaches, `psnr_warped` over the others; NaN where a view has none, or where LPIPS cannot be had.
+    Images and truth go through 8 bits first. `known` is 1 where a reference reaches; `psnr_holes`
+    is over the other pixels, `psnr_warped` over these; NaN where a view has none, or where LPIPS
+    cannot be had.
     """
-    assert prediction.batch.warp is not None
-    truth = quantised(prediction.batch.image)
-    known = prediction.batch.warp.mask
+    truth = quantised(truth)
     tables = []
-    for method, image in prediction.images.items():
+    for method, image in images.items():
         made = quantised(image)
         columns = {
             "psnr": psnr(made, truth),
@@ -77,7 +89,7 @@ def score(prediction: Prediction, lpips: Distance | None) -> pd.DataFrame:
         table = pd.DataFrame(
             {name: values.cpu().double().numpy() for name, values in columns.items()}
         )
-        tables.append(table.assign(method=method, view=prediction.names))
+        tables.append(table.assign(method=method, view=names))
     return pd.concat(tables, ignore_index=True)
 
 

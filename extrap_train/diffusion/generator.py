@@ -85,9 +85,11 @@ class DiffusionGenerator:
     ) -> GeneratedViews:
         config = self.model.config
         size = WARP_SCALE * config.image_size
-        batch, chosen = query_batch(references, queries, config.references, size)
         device = next(self.model.parameters()).device
-        batch = with_warp(batch.to(device), config.image_size)
+        # Geometry keeps its precision where the caller lets the network run in less.
+        with torch.autocast(device.type, enabled=False):
+            batch, chosen = query_batch(references, queries, config.references, size)
+            batch = with_warp(batch.to(device), config.image_size)
         generators = [view_generator(seed, name) for name in names[: len(chosen)]]
         images = sample_views(self.model, batch, self.sampler, generators)
         assert batch.warp is not None

@@ -5,10 +5,8 @@ import time
 import lightning
 import pandas as pd
 import torch
-from jaxtyping import Float
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
-from torch.nn import functional
 
 from extrap_train.config import TrainConfig, TrainerConfig
 from extrap_train.diffusion.evaluation import (
@@ -20,40 +18,12 @@ from extrap_train.diffusion.evaluation import (
     score,
     summarise,
 )
+from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.views import PairBatch
 
 _STEPS_A_ROW = 20
 """Of `metrics.csv` between two validations."""
-
-
-def diffusion_loss(
-    model: ExtrapolationModel,
-    batch: PairBatch,
-    generator: torch.Generator,
-    condition_dropout: float,
-) -> Float[Tensor, ""]:
-    """Mean squared error of the prediction at one random noise level per example.
-
-    Every random number comes from the (CPU) generator, so that a step is a function of its seed
-    alone.
-    """
-    conditioning = model.condition(batch)
-    target = model.encode_target(batch.image, conditioning, generator)
-    count = len(target)
-    dropped = torch.rand(count, generator=generator) < condition_dropout
-    steps = model.schedule.config["num_train_timesteps"]
-    timestep = torch.randint(0, steps, (count,), generator=generator).to(target.device)
-    noise = torch.randn(target.shape, generator=generator).to(target)
-    noisy = model.schedule.add_noise(target, noise, timestep)
-    conditioning = conditioning.zeroed(dropped.to(target.device))
-    prediction = model(noisy, timestep, conditioning)
-    wanted = {
-        "epsilon": lambda: noise,
-        "sample": lambda: target,
-        "v_prediction": lambda: model.schedule.get_velocity(target, noise, timestep),
-    }[model.config.prediction]()
-    return functional.mse_loss(prediction, wanted)
 
 
 class CategoryTraining(lightning.LightningModule):
@@ -80,7 +50,10 @@ class CategoryTraining(lightning.LightningModule):
         generator = torch.Generator().manual_seed(
             (self.config.seed * 2**20 + self.global_step) * 64 + self.global_rank
         )
-        loss = diffusion_loss(self.model, batch, generator, self.config.trainer.condition_dropout)
+        options = self.config.trainer
+        loss = diffusion_loss(
+            self.model, batch, generator, options.condition_dropout, options.min_snr
+        )
         self.log("loss", loss, logger=False)
         return loss
 

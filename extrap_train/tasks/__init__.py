@@ -3,7 +3,11 @@
 from collections.abc import Callable
 from typing import Any
 
-TASKS = ("category",)
+TASKS = (
+    "category",
+    "scene",
+    "view",
+)
 """Known values of `task=`; each is a module here with `run(config)`."""
 
 

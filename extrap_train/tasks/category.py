@@ -30,7 +30,7 @@ from extrap_train.diffusion.evaluation import Distance
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.errors import InputError
-from extrap_train.metrics import squeeze_lpips
+from extrap_train.metrics import lpips_or_reason
 from extrap_train.runs import RunFolder, open_run, provenance
 from extrap_train.tasks.prepare import prepare_category
 from extrap_train.tasks.results import Results, draw_views, is_finished, write_results
@@ -40,7 +40,7 @@ def run(config: TrainConfig) -> None:
     """Train a category model and leave weights, metrics, pictures and `summary.json` behind."""
     console = Console()
     _quieten_lightning()
-    distance, missing = _lpips(config)
+    distance, missing = lpips_or_reason(config.validation.lpips_weights)
     model = _model(config)
     folder = open_run(config)
     try:
@@ -110,15 +110,6 @@ def _quieten_lightning() -> None:
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", module="lightning")
     warnings.filterwarnings("ignore", message=".*(weights|pretrained).*", module="torchvision")
-
-
-def _lpips(config: TrainConfig) -> tuple[Distance | None, dict[str, str]]:
-    try:
-        return squeeze_lpips(config.validation.lpips_weights), {}
-    except InputError as error:
-        if config.validation.lpips_weights is not None:
-            raise
-        return None, {"lpips": str(error)}
 
 
 def _model(config: TrainConfig) -> ExtrapolationModel:

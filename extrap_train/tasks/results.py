@@ -64,7 +64,7 @@ def write_results(
         "parameters": results.parameters,
         "provenance": {**results.provenance, "validation": asdict(config.validation)},
     }
-    write_whole(folder.summary, (json.dumps(_without_nan(summary), indent=1) + "\n").encode())
+    write_whole(folder.summary, (json.dumps(without_nan(summary), indent=1) + "\n").encode())
     console.print(_table(validation))
     for name, reason in results.missing.items():
         console.print(f"missing {name}: {reason}")
@@ -98,10 +98,10 @@ def draw_curve(folder: RunFolder) -> None:
         curve(rows["step"].tolist(), series, "PSNR above the best baseline, dB", path)
 
 
-def _without_nan(value: Any) -> Any:
+def without_nan(value: Any) -> Any:
     """JSON has no NaN: a mean over no view at all becomes null."""
     if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
+        return {key: without_nan(item) for key, item in value.items()}
     return None if isinstance(value, float) and math.isnan(value) else value
 
 

@@ -7,9 +7,9 @@ import torch
 
 from extrap_train.config import ModelConfig, SamplerConfig
 from extrap_train.data.module import with_warp
+from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sample_views, view_generator
-from extrap_train.diffusion.training import diffusion_loss
 from extrap_train.views import PairBatch
 
 

@@ -10,6 +10,7 @@ from extrap_train.config import ModelConfig, SamplerConfig
 from extrap_train.diffusion.conditioning import Conditioning, filled_warp
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sample_views, view_generator
+from extrap_train.diffusion.schedule import even_in_log_snr, noise_schedule, solver_of
 from extrap_train.views import PairBatch
 
 
@@ -97,7 +98,7 @@ def test_an_untrained_model_returns_the_filled_warp(config: ModelConfig, batch: 
 
 
 class GaussianDenoiser(nn.Module):
-    """The exact ε of latents that are normal with spread 0.5: its probability flow has a closed
+    """The exact v of latents that are normal with spread 0.5: its probability flow has a closed
     form.
     """
 
@@ -109,31 +110,49 @@ class GaussianDenoiser(nn.Module):
         self.condition = model.condition
         self.decode_target = lambda latent, _: nn.functional.pixel_shuffle(latent, 2)
 
+    def spread_at(self, alpha: Tensor) -> Tensor:
+        return (alpha * self.spread**2 + 1 - alpha).sqrt()
+
     def forward(self, noisy: Tensor, timestep: Tensor, conditioning: Conditioning) -> Tensor:
         alpha = self.schedule.alphas_cumprod[timestep][:, None, None, None]
-        return (1 - alpha).sqrt() * noisy / (alpha * self.spread**2 + 1 - alpha)
+        gain = (alpha * (1 - alpha)).sqrt() * (1 - self.spread**2)
+        return gain * noisy / self.spread_at(alpha) ** 2
 
 
-@pytest.mark.parametrize(("solver", "gain"), [("dpmpp", 3), ("unipc", 5)])
-def test_second_order_solvers_need_fewer_steps(
-    config: ModelConfig, batch: PairBatch, solver: str, gain: float
+@pytest.mark.parametrize("zero_snr", [False, True])
+@pytest.mark.parametrize("solver", ["dpmpp", "unipc"])
+def test_second_order_solvers_follow_the_flow_in_fewer_steps(
+    config: ModelConfig, batch: PairBatch, solver: str, zero_snr: bool
 ) -> None:
     """Against the exact solution of the flow: noise scaled by the spreads' ratio."""
-    chosen = replace(config, prediction="epsilon", zero_terminal_snr=False)
+    chosen = replace(config, prediction="v_prediction", zero_terminal_snr=zero_snr)
     denoiser = GaussianDenoiser(ExtrapolationModel(chosen))
     names = "abc"
+    drawn = torch.stack([torch.randn(12, 16, 16, generator=view_generator(0, n)) for n in names])
+    noise = nn.functional.pixel_shuffle(drawn, 2)
 
     def error(options: SamplerConfig) -> float:
-        first = denoiser.schedule.alphas_cumprod[999 if options.solver != "ddim" else 951]
-        last = denoiser.schedule.alphas_cumprod[0]
-        start, end = ((a * denoiser.spread**2 + 1 - a).sqrt() for a in (first, last))
-        noise = torch.stack(
-            [torch.randn(12, 16, 16, generator=view_generator(0, n)) for n in names]
-        )
+        """Of the picture's scale, which is all that the flow changes."""
+        timesteps = solver_of(denoiser.schedule, options).timesteps
+        start = denoiser.spread_at(denoiser.schedule.alphas_cumprod[timesteps[0]])
         made = sample_views(denoiser, batch, options, [view_generator(0, n) for n in names])
-        return float((made - noise * end / start).abs().mean())
+        return float(((made / noise) * start / denoiser.spread - 1).abs().mean())
 
-    assert error(SamplerConfig(solver, steps=20)) < error(SamplerConfig("ddim", steps=20)) / gain
+    first_order = error(SamplerConfig("ddim", steps=50))
+    assert error(SamplerConfig(solver, steps=15)) < first_order
+    assert error(SamplerConfig(solver, steps=60)) < 0.25 * first_order
+
+
+def test_timesteps_even_in_log_snr_are_distinct_and_reach_both_ends(config: ModelConfig) -> None:
+    alphas = noise_schedule(config).alphas_cumprod.clamp(min=2**-24)
+    for count in (1, 2, 15, 60, 1000):
+        levels = even_in_log_snr(alphas, count)
+        assert levels[0] == 999
+        assert (levels.diff() < 0).all()
+        assert count == 1 or levels[-1] == 0
+    ratio = 0.5 * torch.log(alphas / (1 - alphas))
+    steps = ratio[even_in_log_snr(alphas, 12)][1:].diff()
+    assert steps.max() / steps.min() < 1.3
 
 
 def test_steps_without_guidance_pass_the_network_once(

@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from extrap_train.config import ModelConfig, TrainerConfig
+from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.model import ExtrapolationModel
-from extrap_train.diffusion.training import diffusion_loss, rate_at
+from extrap_train.diffusion.training import rate_at
 from extrap_train.views import PairBatch
 
 

@@ -1,0 +1,90 @@
+"""A scene's adapter: low-rank additions to a denoiser's layers, saved apart from its weights."""
+
+import hashlib
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import peft
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import nn
+
+from extrap_train.config import LoraConfig
+from extrap_train.data.files import write_whole
+from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.errors import InputError
+
+_ATTENTION = ["to_q", "to_k", "to_v", "to_out.0"]
+_CONVOLUTIONS = ["conv1", "conv2"]
+_WEIGHTS = "adapter_model.safetensors"
+_BASE = "base.json"
+"""Beside peft's files: which weights the adapter was trained upon."""
+
+
+def add_adapter(model: ExtrapolationModel, options: LoraConfig, seed: int) -> peft.PeftModel:
+    """Put a new adapter upon the denoiser and let nothing else learn.
+
+    It starts without effect. The base weights stay what they are, in memory and on disk;
+    `PeftModel.unload` takes the adapter off again.
+    """
+    targets = _ATTENTION + (_CONVOLUTIONS if options.convolutions else [])
+    config = peft.LoraConfig(r=options.rank, lora_alpha=options.rank, target_modules=targets)
+    model.requires_grad_(False)
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        return peft.get_peft_model(model.unet, config)
+
+
+def save_adapter(adapter: peft.PeftModel, folder: Path) -> None:
+    """Write a peft adapter folder, whole or not at all; an older one of that name is replaced."""
+    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
+    shutil.rmtree(temporary, ignore_errors=True)
+    try:
+        adapter.save_pretrained(str(temporary))
+        base = {"sha256": _base_hash(adapter.get_base_model())}
+        write_whole(temporary / _BASE, json.dumps(base).encode())
+        if folder.exists():
+            shutil.rmtree(folder)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        temporary.replace(folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def load_adapter(model: ExtrapolationModel, folder: Path) -> peft.PeftModel:
+    """Put a saved adapter upon the denoiser; InputError where it was trained upon other weights."""
+    try:
+        wanted = json.loads((folder / _BASE).read_text())["sha256"]
+        config = peft.PeftConfig.from_pretrained(str(folder))
+        weights = load_file(folder / _WEIGHTS)
+    except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
+        reason = f"{type(error).__name__} {error}".splitlines()[0]
+        raise InputError(
+            f"adapter={folder}: is no adapter folder of task=scene ({reason}); make it anew"
+        ) from None
+    if wanted != _base_hash(model.unet):
+        raise InputError(
+            f"adapter={folder}: was trained upon other weights than these; give weights= as it was "
+            "then, or adapt these with task=scene"
+        )
+    adapter = peft.get_peft_model(model.unet, config)
+    found: Any = peft.set_peft_model_state_dict(adapter, weights)
+    missing = [key for key in found.missing_keys if ".lora_" in key]
+    if missing or found.unexpected_keys:
+        odd = [*missing, *found.unexpected_keys]
+        raise InputError(f"adapter={folder}: {len(odd)} tensors do not fit, first {odd[0]}")
+    return adapter
+
+
+def _base_hash(unet: nn.Module) -> str:
+    """Of the denoiser's own weights, whether or not an adapter lies upon them."""
+    digest = hashlib.sha256()
+    for name, value in sorted(unet.state_dict().items()):
+        if ".lora_" not in name:
+            digest.update(name.replace(".base_layer", "").encode())
+            digest.update(value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy())
+    return digest.hexdigest()

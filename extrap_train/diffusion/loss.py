@@ -1,0 +1,69 @@
+"""The denoising loss: how far a prediction is from what the schedule asks for."""
+
+import torch
+from diffusers import DDIMScheduler
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import functional
+
+from extrap_train.diffusion.conditioning import Conditioning
+from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.views import PairBatch
+
+
+def diffusion_loss(
+    model: ExtrapolationModel,
+    batch: PairBatch,
+    generator: torch.Generator,
+    condition_dropout: float,
+    min_snr: float | None = None,
+) -> Float[Tensor, ""]:
+    """Mean squared error of the prediction at one random noise level per example.
+
+    Every random number comes from the (CPU) generator, so that a step is a function of its seed
+    alone. `min_snr` weighs the levels, see `snr_weights`.
+    """
+    conditioning = model.condition(batch)
+    target = model.encode_target(batch.image, conditioning, generator)
+    count = len(target)
+    dropped = torch.rand(count, generator=generator) < condition_dropout
+    steps = model.schedule.config["num_train_timesteps"]
+    timestep = torch.randint(0, steps, (count,), generator=generator).to(target.device)
+    noise = torch.randn(target.shape, generator=generator).to(target)
+    conditioning = conditioning.zeroed(dropped.to(target.device))
+    errors = prediction_errors(model, target, noise, timestep, conditioning)
+    if min_snr is not None:
+        errors = errors * snr_weights(model.schedule, timestep, min_snr)
+    return errors.mean()
+
+
+def prediction_errors(
+    model: ExtrapolationModel,
+    target: Float[Tensor, "b z h w"],
+    noise: Float[Tensor, "b z h w"],
+    timestep: Int[Tensor, " b"],
+    conditioning: Conditioning,
+) -> Float[Tensor, " b"]:
+    """Each example's mean squared error at a noise level of one's choice."""
+    noisy = model.schedule.add_noise(target, noise, timestep)
+    prediction = model(noisy, timestep, conditioning)
+    wanted = {
+        "epsilon": lambda: noise,
+        "sample": lambda: target,
+        "v_prediction": lambda: model.schedule.get_velocity(target, noise, timestep),
+    }[model.config.prediction]()
+    return functional.mse_loss(prediction, wanted, reduction="none").mean((1, 2, 3))
+
+
+def snr_weights(
+    schedule: DDIMScheduler, timestep: Int[Tensor, " b"], gamma: float
+) -> Float[Tensor, " b"]:
+    """Min-SNR-γ: the error of the clean sample weighed by min(SNR, γ) (Hang et al. 2023).
+
+    In terms of ε that is min(SNR, γ)/SNR, of v min(SNR, γ)/(SNR + 1). At zero terminal SNR it is 0:
+    the noisiest step learns nothing from itself.
+    """
+    alpha = schedule.alphas_cumprod.to(timestep.device)[timestep]
+    snr = alpha / (1 - alpha)
+    per_unit = {"epsilon": snr, "sample": torch.ones_like(snr), "v_prediction": snr + 1}
+    return snr.clamp(max=gamma) / per_unit[schedule.config["prediction_type"]]

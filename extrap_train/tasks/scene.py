@@ -1,0 +1,183 @@
+"""`task=scene`: a category model adapted to one scene from its input views alone."""
+
+import io
+import json
+import math
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.fabric import Fabric
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from data_prep.views import target_views
+from extrap_train.config import TrainConfig
+from extrap_train.data.files import write_whole
+from extrap_train.data.module import spread
+from extrap_train.data.scene_pairs import ScenePairs
+from extrap_train.diffusion.adaptation import Adaptation, adapt
+from extrap_train.diffusion.evaluation import Distance, score_images, summarise
+from extrap_train.diffusion.generator import DiffusionGenerator, GeneratedViews
+from extrap_train.diffusion.lora import add_adapter, save_adapter
+from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.errors import InputError
+from extrap_train.metrics import lpips_or_reason
+from extrap_train.pictures import contact_sheet, curve, error_map, mark_holes
+from extrap_train.tasks.results import without_nan
+from extrap_train.tasks.scene_inputs import SceneInputs, fabric_of, open_inputs, trained_model
+from extrap_train.views import View, stack_cameras
+
+
+def run(config: TrainConfig) -> None:
+    """Train an adapter for `minutes` and leave it with its numbers and pictures behind.
+
+    What the input views leave over of the scene is held out: the model is measured there with and
+    without the adapter.
+    """
+    console = Console()
+    if config.adapter is not None:
+        raise InputError("task=scene makes an adapter and takes none: leave adapter= out")
+    distance, missing = lpips_or_reason(config.validation.lpips_weights)
+    fabric = fabric_of(config)
+    model = trained_model(config).to(fabric.device)
+    inputs = open_inputs(config, model.config.image_size)
+    pairs = ScenePairs(inputs.views, model.config.references)
+    folder = Path(config.output) / "scene" / inputs.label
+    asked = _asked(config, inputs)
+    if config.resume and _is_done(folder, asked):
+        console.print(f"already adapted with these options: {folder}")
+        return
+    targets = _targets(config, inputs, model)
+    before = _generate(model, config, inputs, targets, fabric)
+    adapter = add_adapter(model, config.lora, config.seed)
+    with _bar() as bar:
+        task = bar.add_task("adapt", total=1.0, note="")
+
+        def on_step(step: int, share: float) -> None:
+            bar.update(task, completed=min(share, 1.0), note=f"step {step}")
+
+        done = adapt(
+            model,
+            adapter,
+            pairs,
+            config.lora,
+            config.sampler,
+            seconds=60 * config.minutes,
+            seed=config.seed,
+            fabric=fabric,
+            on_step=on_step,
+        )
+    save_adapter(adapter, folder / "adapter")
+    after = _generate(model, config, inputs, targets, fabric)
+    measured = _measure(before, after, targets, folder, distance)
+    _write(folder, asked, done, pairs, measured, missing)
+    console.print(_said(done, measured))
+    console.print(f"result: {folder}")
+
+
+def _asked(config: TrainConfig, inputs: SceneInputs) -> dict[str, Any]:
+    return {
+        "scene": config.scene,
+        "inputs": [view.name for view in inputs.views],
+        "weights": config.weights,
+        "depth": asdict(config.depth),
+        "lora": asdict(config.lora),
+        "sampler": asdict(config.sampler),
+        "minutes": config.minutes,
+        "seed": config.seed,
+    }
+
+
+def _is_done(folder: Path, asked: dict[str, Any]) -> bool:
+    summary = folder / "summary.json"
+    return summary.is_file() and json.loads(summary.read_text())["asked"] == asked
+
+
+def _targets(config: TrainConfig, inputs: SceneInputs, model: ExtrapolationModel) -> list[View]:
+    chosen = spread(len(inputs.others), config.validation.examples)
+    return target_views([inputs.others[i] for i in chosen], model.config.image_size)
+
+
+def _generate(
+    model: ExtrapolationModel,
+    config: TrainConfig,
+    inputs: SceneInputs,
+    targets: list[View],
+    fabric: Fabric,
+) -> GeneratedViews | None:
+    if not targets:
+        return None
+    cameras = stack_cameras([view.camera for view in targets])
+    with fabric.autocast():
+        generator = DiffusionGenerator(model, config.sampler)
+        names = [view.name for view in targets]
+        return generator.generate(inputs.views, cameras, names, config.seed)
+
+
+def _measure(
+    before: GeneratedViews | None,
+    after: GeneratedViews | None,
+    targets: list[View],
+    folder: Path,
+    distance: Distance | None,
+) -> dict[str, dict[str, float]]:
+    """Scores on the held-out views with and without the adapter, and a picture of them."""
+    if before is None or after is None:
+        return {}
+    truth = torch.stack([view.image for view in targets])
+    images = {"model": before.images, "adapted": after.images}
+    names = [view.name for view in targets]
+    scores = score_images(images, truth, after.warp.mask, names, distance)
+    text = io.StringIO()
+    scores.to_csv(text, index=False)
+    write_whole(folder / "held_out.csv", text.getvalue().encode())
+    contact_sheet(
+        {
+            "warp": mark_holes(after.warp.image, after.warp.mask),
+            **images,
+            "truth": truth,
+            "error": error_map(after.images, truth),
+        },
+        folder / "held_out.png",
+    )
+    return summarise(scores)
+
+
+def _write(
+    folder: Path,
+    asked: dict[str, Any],
+    done: Adaptation,
+    pairs: ScenePairs,
+    measured: dict[str, dict[str, float]],
+    missing: dict[str, str],
+) -> None:
+    steps, losses = [list(column) for column in zip(*done.losses, strict=True)]
+    curve(steps, {"held-out pair": losses}, "denoising error", folder / "curve.png")
+    summary = {
+        "asked": asked,
+        "pairs": {"all": len(pairs.all), "trained": len(pairs.training)},
+        "adaptation": asdict(done),
+        "held_out": measured,
+        "missing": missing if measured else {"held_out": "every frame of the scene is an input"},
+    }
+    content = json.dumps(without_nan(summary), indent=1) + "\n"
+    write_whole(folder / "summary.json", content.encode())
+
+
+def _said(done: Adaptation, measured: dict[str, dict[str, float]]) -> str:
+    kept = f"kept step {done.best_step} of {done.steps}" if done.best_step else "kept the base"
+    text = f"ended by {done.ended} after {done.seconds:.0f} s, {kept}"
+    if measured:
+        one, other = measured["model"], measured["adapted"]
+        text += f"; held-out views: PSNR {one['psnr']:.2f} → {other['psnr']:.2f} dB"
+        if not math.isnan(one["lpips"]):
+            text += f", LPIPS {one['lpips']:.3f} → {other['lpips']:.3f}"
+    return text
+
+
+def _bar() -> Progress:
+    return Progress(
+        TextColumn("adapt"), BarColumn(), TimeRemainingColumn(), TextColumn("{task.fields[note]}")
+    )

@@ -1,0 +1,82 @@
+"""What the tasks about one scene start from: its views, and the model that sees them."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lightning.fabric import Fabric
+
+from data_prep.views import choose_frames, input_views
+from extrap_train.config import SyntheticConfig, TrainConfig
+from extrap_train.data.photographs import CATEGORY
+from extrap_train.data.scene import open_scene
+from extrap_train.data.sequences import Frame, Sequence
+from extrap_train.depth.build import depth_source
+from extrap_train.diffusion.checkpoint import load_model, packaged_weights
+from extrap_train.diffusion.lora import load_adapter
+from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.errors import InputError
+from extrap_train.geometry.reduction import WARP_SCALE
+from extrap_train.views import View
+
+
+@dataclass(frozen=True)
+class SceneInputs:
+    """A scene's chosen views with depth, and its frames that are left over."""
+
+    sequence: Sequence
+    views: list[View]
+    """Square, at the size that a model's warps are made at."""
+    others: list[Frame]
+
+    @property
+    def label(self) -> str:
+        """The scene's name in a path."""
+        sequence = self.sequence
+        if sequence.category == CATEGORY:
+            return sequence.name
+        return f"{sequence.category}-{sequence.name}"
+
+
+def open_inputs(config: TrainConfig, image_size: int) -> SceneInputs:
+    """The scene's input views for a model of this size; depth comes from these views alone."""
+    if config.scene is None:
+        raise InputError(f"task={config.task} needs a scene: give scene=PATH (see --help)")
+    synthetic = config.data if isinstance(config.data, SyntheticConfig) else None
+    sequence = open_scene(config.scene, synthetic)
+    chosen = choose_frames(sequence, config.input_frames, config.inputs)
+    views = input_views(sequence, chosen, depth_source(config.depth), WARP_SCALE * image_size)
+    others = [frame for i, frame in enumerate(sequence.frames) if i not in chosen]
+    return SceneInputs(sequence, views, others)
+
+
+def trained_model(config: TrainConfig) -> ExtrapolationModel:
+    """The model that `weights` names, by default the category's newest, with its adapter if any."""
+    if config.weights is not None:
+        return open_model(config.weights, config.adapter)
+    category, name = config.category.name, config.model.name
+    newest = Path(config.output) / "train" / category / name / "latest" / "model"
+    if not newest.is_dir():
+        raise InputError(
+            f"{newest}: there is no trained model of {category}; train one (task=category), or "
+            "give weights=FOLDER, or weights=base for the packaged model"
+        )
+    return open_model(str(newest), config.adapter)
+
+
+def open_model(weights: str, adapter: str | None = None) -> ExtrapolationModel:
+    """The model of a folder, or `base`, the packaged one, with a scene's adapter upon it if any."""
+    folder = Path(weights)
+    if not folder.is_dir() and weights != "base":
+        raise InputError(f"weights={weights}: is neither a model folder nor `base`")
+    model = load_model(folder if folder.is_dir() else packaged_weights(weights))
+    if adapter is not None:
+        load_adapter(model, Path(adapter))
+    return model.eval()
+
+
+def fabric_of(config: TrainConfig) -> Fabric:
+    """Device and precision that the network runs with."""
+    options = config.trainer
+    precision: Any = options.precision
+    return Fabric(accelerator=options.accelerator, devices=1, precision=precision)

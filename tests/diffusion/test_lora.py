@@ -1,0 +1,170 @@
+"""An adapter changes what a model paints and never the model; it comes back as it was saved."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import peft
+import pytest
+import torch
+from lightning.fabric import Fabric
+from orbits import ring
+from torch import Tensor, nn
+
+from extrap_train.config import LoraConfig, ModelConfig, SamplerConfig
+from extrap_train.data.scene_pairs import ScenePairs
+from extrap_train.diffusion.adaptation import Adaptation, adapt
+from extrap_train.diffusion.lora import add_adapter, load_adapter, save_adapter
+from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.sampler import sample_views, view_generator
+from extrap_train.errors import InputError
+from extrap_train.views import PairBatch, View
+
+OPTIONS = LoraConfig(rank=2, convolutions=True, steps=12, validate_every=4, batch_size=4)
+
+
+def _model(config: ModelConfig) -> ExtrapolationModel:
+    torch.manual_seed(0)
+    model = ExtrapolationModel(config).eval()
+    nn.init.normal_(model.unet.conv_out.weight, std=0.05)
+    return model
+
+
+def _painted(model: ExtrapolationModel, batch: PairBatch) -> Tensor:
+    return sample_views(model, batch, SamplerConfig(), [view_generator(0, n) for n in "abc"])
+
+
+def _randomised(model: ExtrapolationModel) -> peft.PeftModel:
+    adapter = add_adapter(model, OPTIONS, seed=0)
+    torch.manual_seed(1)
+    for name, weight in adapter.named_parameters():
+        if "lora_B" in name:
+            nn.init.normal_(weight, std=0.1)
+    return adapter
+
+
+def test_a_new_adapter_has_no_effect_and_only_it_learns(
+    config: ModelConfig, batch: PairBatch
+) -> None:
+    model = _model(config)
+    before = _painted(model, batch)
+    add_adapter(model, OPTIONS, seed=0)
+    torch.testing.assert_close(_painted(model, batch), before)
+    learning = {n for n, p in model.named_parameters() if p.requires_grad}
+    assert learning
+    assert all(".lora_" in name for name in learning)
+    assert any("attn1" in name for name in learning)
+    assert any("conv1" in name for name in learning)
+
+
+def test_it_comes_back_as_it_was_saved_and_goes_without_a_trace(
+    config: ModelConfig, batch: PairBatch, tmp_path: Path
+) -> None:
+    model = _model(config)
+    state = {name: value.clone() for name, value in model.state_dict().items()}
+    before = _painted(model, batch)
+    adapter = _randomised(model)
+    adapted = _painted(model, batch)
+    assert (adapted - before).abs().max() > 1e-3
+    save_adapter(adapter, tmp_path / "adapter")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["adapter"]
+    adapter.unload()
+    assert all(torch.equal(state[name], value) for name, value in model.state_dict().items())
+    fresh = _model(config)
+    load_adapter(fresh, tmp_path / "adapter")
+    torch.testing.assert_close(_painted(fresh, batch), adapted)
+
+
+def test_plain_peft_reads_the_folder(config: ModelConfig, batch: PairBatch, tmp_path: Path) -> None:
+    model = _model(config)
+    save_adapter(_randomised(model), tmp_path / "adapter")
+    adapted = _painted(model, batch)
+    fresh = _model(config)
+    peft.PeftModel.from_pretrained(fresh.unet, str(tmp_path / "adapter"))
+    torch.testing.assert_close(_painted(fresh, batch), adapted)
+
+
+def test_other_weights_and_other_folders_are_refused(config: ModelConfig, tmp_path: Path) -> None:
+    save_adapter(_randomised(_model(config)), tmp_path / "adapter")
+    other = _model(config)
+    nn.init.normal_(other.unet.conv_out.weight, std=0.1)
+    with pytest.raises(InputError, match="was trained upon other weights"):
+        load_adapter(other, tmp_path / "adapter")
+    with pytest.raises(InputError, match="is no adapter folder of task=scene"):
+        load_adapter(_model(config), tmp_path / "gone")
+    weights = tmp_path / "adapter" / "adapter_model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:100])
+    with pytest.raises(InputError, match="is no adapter folder of task=scene"):
+        load_adapter(_model(config), tmp_path / "adapter")
+
+
+def _views(count: int) -> list[View]:
+    """Bumpy walls seen from an arc, at the size that warps are made at."""
+    cameras = ring(torch.arange(count).numpy() * 25.0).squared(64)
+    images = torch.rand(count, 3, 8, 8, generator=torch.Generator().manual_seed(0))
+    smooth = nn.functional.interpolate(images, size=(64, 64), mode="bilinear")
+    depth = torch.full((64, 64), 3.0)
+    return [View(smooth[i], cameras[i], depth, name=f"v{i}") for i in range(count)]
+
+
+def _adapt(
+    config: ModelConfig, seconds: float = 1e9, **options: Any
+) -> tuple[ExtrapolationModel, Adaptation]:
+    model = _model(config)
+    chosen = replace(OPTIONS, **options)
+    adapter = add_adapter(model, chosen, seed=0)
+    done = adapt(
+        model,
+        adapter,
+        ScenePairs(_views(3), 3),
+        chosen,
+        SamplerConfig(),
+        seconds=seconds,
+        seed=0,
+        fabric=Fabric(accelerator="cpu", devices=1),
+    )
+    return model, done
+
+
+def test_the_pairs_are_all_ordered_ones_and_the_held_out_query_is_never_a_target() -> None:
+    pairs = ScenePairs(_views(4), 3)
+    assert len(pairs.all) == 12
+    assert len(set(pairs.all)) == 12
+    query, reference = pairs.held_out
+    assert abs(query - reference) in (2, 3), "50 or 75 degrees, nearest to 60"
+    assert len(pairs.training) == 9
+    assert all(other != query for other, _ in pairs.training)
+    batch = pairs.held_out_batch(2)
+    torch.testing.assert_close(batch.image[0], _views(4)[query].image)
+    torch.testing.assert_close(batch.reference_images[0, 0], _views(4)[reference].image)
+
+
+def test_one_view_has_no_pairs() -> None:
+    with pytest.raises(InputError, match="1 input view, and pairs need at least two"):
+        ScenePairs(_views(1), 3)
+
+
+def test_adapting_learns_the_scene_repeatably_and_keeps_the_best(config: ModelConfig) -> None:
+    model, done = _adapt(config, steps=40, learning_rate=3e-3, patience=100)
+    again, done_again = _adapt(config, steps=40, learning_rate=3e-3, patience=100)
+    assert done.losses == done_again.losses
+    for one, other in zip(model.parameters(), again.parameters(), strict=True):
+        assert torch.equal(one, other)
+    losses = dict(done.losses)
+    assert done.best_step > 0
+    assert losses[done.best_step] == min(losses.values()) < losses[0]
+    assert done.ended == "steps"
+
+
+def test_it_ends_where_the_held_out_pair_gains_no_more_or_the_time_is_up(
+    config: ModelConfig,
+) -> None:
+    """A rate that destroys the model never gains: the base is kept."""
+    model, done = _adapt(config, steps=400, learning_rate=30.0, patience=2)
+    assert done.ended == "held-out pair"
+    assert done.steps <= 40
+    if done.best_step == 0:
+        assert not any(p.any() for n, p in model.named_parameters() if "lora_B" in n)
+    _, timed = _adapt(config, steps=400, seconds=0.2)
+    assert timed.ended == "time"
+    assert timed.steps < 400

@@ -1,0 +1,132 @@
+"""One scene on the command line: adapt to it, look at it from a pose and from a walk around it."""
+
+import json
+import math
+import sys
+from pathlib import Path
+
+import cv2
+import pytest
+import torch
+from PIL import Image
+
+from extrap_train.__main__ import main
+from extrap_train.config import ModelConfig, UNetConfig
+from extrap_train.diffusion.checkpoint import save_model
+from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.tasks.view import open_generator, open_views, walk
+
+_UNET = UNetConfig(channels=[16, 32], attention_levels=[False, True], heads=2, token_width=16)
+_TINY = ModelConfig(name="tiny", image_size=16, octaves=2, unet=_UNET)
+_SCENE = ["scene=synthetic:hydrant/0000", "data.frames=8", "data.image_size=32", "inputs=4"]
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    torch.manual_seed(0)
+    model = ExtrapolationModel(_TINY)
+    torch.nn.init.normal_(model.unet.conv_out.weight, std=0.05)
+    folder = tmp_path_factory.mktemp("weights") / "model"
+    save_model(model, folder)
+    return folder
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    def run(*arguments: str) -> None:
+        options = ["category=hydrant", *_SCENE, f"output={tmp_path}", "trainer.precision=32-true"]
+        monkeypatch.setattr(sys, "argv", ["extrap_train", *options, *arguments])
+        main()
+
+    return run
+
+
+def _refused(command, *arguments: str) -> str:
+    with pytest.raises(SystemExit) as stopped:
+        command(*arguments)
+    message = str(stopped.value)
+    assert message.startswith("error: ")
+    assert "\n" not in message
+    return message
+
+
+def test_a_walk_around_the_scene_is_pictures_and_films(command, weights, tmp_path) -> None:
+    command("task=view", f"weights={weights}", "orbit=120", "frames=3")
+    folder = tmp_path / "view" / "hydrant-0000"
+    for name in ("orbit", "orbit_warp"):
+        assert Image.open(folder / f"{name}.gif").n_frames == 3
+        film = cv2.VideoCapture(str(folder / f"{name}.mp4"))
+        shapes = [film.read()[1].shape for _ in range(3)]
+        assert shapes == [(128, 128, 3)] * 3
+        assert not film.read()[0]
+    assert Image.open(folder / "views" / "002.png").size == (16, 16)
+    assert (folder / "views" / "002_warp.png").is_file()
+    assert (folder / "sheet.png").is_file()
+
+
+def test_a_frame_as_pose_has_its_photograph_beside_it(command, weights, tmp_path, capsys) -> None:
+    command("task=view", f"weights={weights}", "pose=frame000003")
+    folder = tmp_path / "view" / "hydrant-0000"
+    assert (folder / "views" / "frame000003.png").is_file()
+    assert Image.open(folder / "truth.png").size == (16, 16)
+    assert "PSNR against the photograph" in capsys.readouterr().out
+
+
+def test_the_same_in_three_lines_of_python(weights) -> None:
+    generator = open_generator(str(weights))
+    views = open_views("synthetic:cup/0001", generator, inputs=3)
+    images = generator.generate(views, *walk(views, degrees=90.0, frames=2)).images
+    assert images.shape == (2, 3, 16, 16)
+
+
+def _poses(path: Path, translation: float) -> Path:
+    """A camera of 512 pixels with a lens of its own."""
+    matrix = torch.eye(4)
+    matrix[2, 3] = translation
+    entry = {"transform_matrix": matrix.tolist(), "w": 512, "h": 512, "fl_x": 300.0}
+    path.write_text(json.dumps({"frames": [entry]}))
+    return path
+
+
+def test_poses_come_from_a_file_with_any_lens(command, weights, tmp_path) -> None:
+    poses = _poses(tmp_path / "poses.json", 4.0)
+    command("task=view", f"weights={weights}", f"pose={poses}")
+    assert (tmp_path / "view" / "hydrant-0000" / "views" / "000.png").is_file()
+
+
+def test_an_adapter_is_made_used_again_and_put_upon_the_weights(
+    command, weights, tmp_path, capsys
+) -> None:
+    options = ["minutes=0.2", "lora.steps=4", "lora.validate_every=2", "lora.batch_size=2"]
+    command("task=scene", f"weights={weights}", *options)
+    folder = tmp_path / "scene" / "hydrant-0000"
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["pairs"] == {"all": 12, "trained": 9}
+    assert summary["adaptation"]["steps"] == 4
+    assert set(summary["held_out"]) == {"model", "adapted"}
+    assert math.isfinite(summary["held_out"]["adapted"]["psnr"])
+    assert (folder / "held_out.png").is_file()
+    capsys.readouterr()
+    command("task=scene", f"weights={weights}", *options)
+    assert "already adapted with these options" in capsys.readouterr().out
+    adapter = f"adapter={folder / 'adapter'}"
+    command("task=view", f"weights={weights}", adapter, "pose=frame000003")
+
+
+def test_what_cannot_be_used_is_one_line(command, weights, tmp_path) -> None:
+    given = f"weights={weights}"
+    one = ["task=scene", given, "inputs=1"]
+    assert "has 1 input view, and pairs need at least two" in _refused(command, *one)
+    assert "give scene=PATH" in _refused(command, "task=scene", given, "scene=null")
+    assert "there is no trained model of hydrant" in _refused(command, "task=scene")
+    assert "neither a model folder nor `base`" in _refused(command, "task=scene", "weights=bse")
+    view = ["task=view", given]
+    assert "a pose=FRAME|FILE.json or an orbit=DEGREES" in _refused(command, *view)
+    assert "neither a frame of the scene nor" in _refused(command, *view, "pose=frame99")
+    assert "an orbit needs 3 input views" in _refused(command, *view, "orbit=90", "inputs=2")
+    broken = _poses(tmp_path / "nan.json", math.nan)
+    assert "camera of 000 is degenerate (NaN" in _refused(command, *view, f"pose={broken}")
+    empty = tmp_path / "empty.json"
+    empty.write_text('{"frames": []}')
+    assert "expected frames in a list" in _refused(command, *view, f"pose={empty}")
+    assert "has 8 frames, fewer than the 9" in _refused(command, *view, "orbit=90", "inputs=9")
