@@ -24,10 +24,12 @@ _NOT_PART_OF_THE_RUN = (
     "threads",
     "validation",
     "trainer.steps",
+    "trainer.gradient_checkpointing",
+    "trainer.compile",
     *(field.name for field in fields(SceneOptions)),
 )
-"""May differ on resume: where things lie, how they are measured, how long is trained, and what
-other tasks read.
+"""May differ on resume: where things lie, how they are measured, how long is trained, how the
+machine goes about the same mathematics, and what other tasks read.
 """
 
 _LATEST = "latest"

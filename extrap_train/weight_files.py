@@ -52,7 +52,9 @@ class WeightFile:
             if self.path.suffix == ".safetensors":
                 return load_file(self.path)
             with safe_globals([(Inert, name) for name in inert]):
-                return torch.load(self.path, map_location="cpu", weights_only=True)
+                # Mapped: of ten gigabytes only those are read that are used.
+                mapped = zipfile.is_zipfile(self.path)
+                return torch.load(self.path, map_location="cpu", weights_only=True, mmap=mapped)
         except (pickle.UnpicklingError, TypeError) as error:
             raise self.refusal(self._unsafe(error)) from None
         except (*_DAMAGE, SafetensorError):

@@ -39,6 +39,7 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "model.octaves": (1, 16),
     "model.unet.layers_per_block": (1, 16),
     "model.unet.heads": (1, 64),
+    "model.projection_rate": (0, math.inf),
     "model.unet.token_width": (1, 8192),
     "model.unet.norm_groups": (1, 1024),
     "model.vae.layers_per_block": (1, 16),

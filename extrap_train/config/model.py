@@ -67,9 +67,13 @@ class ModelConfig:
     zero_terminal_snr: bool = True
     unet: UNetConfig = field(default_factory=UNetConfig)
     learning_rate: float = 3e-4
+    projection_rate: float = 1.0
+    """Learning rate of the token's projection, as a multiple of `learning_rate`."""
     weight_decay: float = 0.01
     start: str | None = None
-    """Folder that training starts from; `base` is the packaged model, null random weights."""
+    """What training starts from: a model folder, a published checkpoint (ZeroNVS's .ckpt,
+    MegaScenes's iter_N folder, a diffusers folder), or `base`, the packaged model; null is random.
+    """
 
 
 @dataclass

@@ -73,7 +73,7 @@ class PixelPatches:
 
 
 class KlAutoencoder(Frozen):
-    """Stable Diffusion's variational autoencoder, frozen, in its own precision."""
+    """Stable Diffusion's variational autoencoder, frozen."""
 
     channels = LATENT_CHANNELS
 
@@ -109,13 +109,11 @@ class KlAutoencoder(Frozen):
 
     @torch.no_grad()
     def _posterior(self, image: Float[Tensor, "b 3 h w"]) -> DiagonalGaussianDistribution:
-        with self._in_own_precision(image.device):
-            return self.network.encode(self._at(image * 2 - 1)).latent_dist
+        return self.network.encode(self._at(image * 2 - 1)).latent_dist
 
     def decode(self, latent: Float[Tensor, "b c h2 w2"]) -> Float[Tensor, "b 3 h w"]:
         """See `Autoencoder.decode`."""
-        with self._in_own_precision(latent.device):
-            image = self.network.decode(self._at(latent / LATENT_SCALE)).sample
+        image = self.network.decode(self._at(latent / LATENT_SCALE)).sample
         return image.float() / 2 + 0.5
 
 

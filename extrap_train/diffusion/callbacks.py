@@ -39,9 +39,19 @@ class WholeCheckpointIO(TorchCheckpointIO):
         self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: Any = None
     ) -> None:
         """Write under a temporary name, then rename."""
-        content = io.BytesIO()
-        torch.save(checkpoint, content)
-        write_whole(Path(path), content.getvalue())
+        path = Path(path)
+        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            torch.save(checkpoint, temporary)  # not by way of memory: it is 14 GB at full size
+            temporary.replace(path)
+        except (OSError, RuntimeError) as error:
+            reason = str(error).splitlines()[0]
+            raise InputError(
+                f"{path}: cannot be written ({reason}); free space or choose another output="
+            ) from None
+        finally:
+            temporary.unlink(missing_ok=True)
 
     def load_checkpoint(
         self,

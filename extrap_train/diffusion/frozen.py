@@ -3,7 +3,6 @@
 import copy
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
 
@@ -27,7 +26,3 @@ class Frozen:
         if weight.device != image.device:
             self.network.to(image.device)
         return image.to(weight.dtype)
-
-    @staticmethod
-    def _in_own_precision(device: torch.device) -> torch.autocast:
-        return torch.autocast(device.type, enabled=False)

@@ -52,7 +52,7 @@ class SmallImageEncoder(nn.Sequential):
 
 
 class ClipImageEncoder(Frozen):
-    """CLIP's image tower with its projection, frozen, in its own precision."""
+    """CLIP's image tower with its projection, frozen."""
 
     def __init__(self, config: ClipConfig) -> None:
         super().__init__(
@@ -69,12 +69,14 @@ class ClipImageEncoder(Frozen):
             )
         )
         self.width = config.embedding_width
+        # No weight and in no file, so it must be real where the weights are still on meta.
+        embeddings = self.network.vision_model.embeddings
+        embeddings.position_ids = torch.arange(embeddings.num_positions, device="cpu")[None]
 
     @torch.no_grad()
     def __call__(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b d"]:
         """Embeddings of images in [0, 1], not normalised to unit length."""
-        with self._in_own_precision(image.device):
-            return self.network(self._at(clip_input(image))).image_embeds.float()
+        return self.network(self._at(clip_input(image))).image_embeds.float()
 
 
 def clip_input(image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 224 224"]:

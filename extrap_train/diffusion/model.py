@@ -2,18 +2,21 @@
 prediction.
 """
 
+from typing import Any
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from extrap_train.config import ModelConfig
-from extrap_train.diffusion.autoencoder import build_autoencoder
+from extrap_train.diffusion.autoencoder import KlAutoencoder, build_autoencoder
 from extrap_train.diffusion.conditioning import Conditioning
 from extrap_train.diffusion.denoiser import build_unet
 from extrap_train.diffusion.family import FAMILIES
-from extrap_train.diffusion.image_encoder import build_image_encoder
+from extrap_train.diffusion.image_encoder import ClipImageEncoder, build_image_encoder
 from extrap_train.diffusion.pose_encoding import POSE_CHANNELS
 from extrap_train.diffusion.schedule import noise_schedule
+from extrap_train.errors import InputError
 from extrap_train.views import PairBatch
 
 
@@ -40,10 +43,30 @@ class ExtrapolationModel(nn.Module):
         width = self.image_encoder.width
         self.cc_projection = nn.Linear(width + POSE_CHANNELS, config.unet.token_width)
         self.null = self.family.null(latent_channels, width)
-        self.schedule = noise_schedule(config)
+        with torch.device("cpu"):  # weights may be on the meta device until they are loaded
+            self.schedule = noise_schedule(config)
+
+    def parts(self) -> dict[str, Any]:
+        """Every network of the model, the frozen ones, too, by the name of its folder on disk."""
+        parts: dict[str, Any] = {"unet": self.unet, "cc_projection": self.cc_projection}
+        if isinstance(self.autoencoder, KlAutoencoder):
+            parts["vae"] = self.autoencoder.network
+        encoder = self.image_encoder
+        parts["image_encoder"] = (
+            encoder.network if isinstance(encoder, ClipImageEncoder) else encoder
+        )
+        return parts
 
     def condition(self, batch: PairBatch) -> Conditioning:
-        """The batch's condition; the batch must hold its warp."""
+        """The batch's condition; the batch must hold its warp.
+
+        Raises InputError for views of another size: a denoiser paints nothing sensible there.
+        """
+        if (batch.camera.height, batch.camera.width) != (self.config.image_size,) * 2:
+            raise InputError(
+                f"views of {batch.camera.width} x {batch.camera.height} pixels, but the model was "
+                f"trained on {self.config.image_size} x {self.config.image_size}: resize them"
+            )
         latents, base = self.family.latents(batch, self.autoencoder, self.config)
         image = self.image_encoder(batch.reference_images[:, 0])
         embedding = torch.cat([image, self.family.pose(batch)], -1)

@@ -1,6 +1,7 @@
 """The training loop's mathematics and its optimiser, as a LightningModule."""
 
 import time
+from typing import Any
 
 import lightning
 import pandas as pd
@@ -99,8 +100,15 @@ class CategoryTraining(lightning.LightningModule):
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         """AdamW with a linear warm-up, as MegaScenes trains, and a late inverse-root decay."""
         model, trainer = self.config.model, self.config.trainer
+        projection = list(self.model.cc_projection.parameters())
+        others = [x for x in self.model.parameters() if all(x is not y for y in projection)]
+        rate_of_projection = model.learning_rate * model.projection_rate
+        groups: list[dict[str, Any]] = [
+            {"params": others},
+            {"params": projection, "lr": rate_of_projection},
+        ]
         optimizer = torch.optim.AdamW(
-            self.model.parameters(),
+            groups,
             lr=model.learning_rate,
             weight_decay=model.weight_decay,
             betas=(0.9, 0.99),

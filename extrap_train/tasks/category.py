@@ -25,8 +25,9 @@ from extrap_train.diffusion.callbacks import (
     WholeCheckpointIO,
     checkpoints,
 )
-from extrap_train.diffusion.checkpoint import save_model, start_weights
+from extrap_train.diffusion.checkpoint import initial_model, save_model
 from extrap_train.diffusion.evaluation import Distance
+from extrap_train.diffusion.memory import advice_where_memory_ends, training_memory
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.errors import InputError
@@ -42,6 +43,8 @@ def run(config: TrainConfig) -> None:
     _quieten_lightning()
     distance, missing = lpips_or_reason(config.validation.lpips_weights)
     model = _model(config)
+    if (needed := training_memory(model, config.trainer)).is_worth_a_word:
+        console.print(f"{needed}")
     folder = open_run(config)
     try:
         with FileLock(folder.path / ".lock", timeout=0):
@@ -70,7 +73,8 @@ def _train(
     training = CategoryTraining(model, config, _names(data), distance)
     started = time.perf_counter()
     trainer = _trainer(config, folder)
-    trainer.fit(training, data, ckpt_path=_newest(folder), weights_only=True)
+    with advice_where_memory_ends(config.trainer):
+        trainer.fit(training, data, ckpt_path=_newest(folder), weights_only=True)
     seconds["train"] = time.perf_counter() - started
     if training.validated_step != trainer.global_step:
         trainer.validate(training, data, verbose=False)
@@ -114,9 +118,14 @@ def _quieten_lightning() -> None:
 
 def _model(config: TrainConfig) -> ExtrapolationModel:
     torch.manual_seed(config.seed)
-    model = ExtrapolationModel(config.model)
-    start_weights(model, config.model.start)
-    return model.to(memory_format=torch.channels_last)
+    model = initial_model(config.model)
+    for network in model.parts().values():
+        network.to(memory_format=torch.channels_last)
+    if config.trainer.gradient_checkpointing:
+        model.unet.enable_gradient_checkpointing()
+    if config.trainer.compile:
+        model.unet.compile()
+    return model
 
 
 def _data_module(config: TrainConfig, prepared: list[PreparedData]) -> PairModule:
@@ -192,7 +201,7 @@ def _trainer(config: TrainConfig, folder: RunFolder) -> lightning.Trainer:
         ],
         plugins=[WholeCheckpointIO()],
         callbacks=[
-            AveragedWeights(options.ema_decay),
+            *([AveragedWeights(options.ema_decay)] if options.ema_decay else []),
             StepProgress(options.steps),
             _Pictures(folder.samples),
             EpochCheckpoints(folder.checkpoints),

@@ -10,7 +10,7 @@ import torch
 from diffusers import DDIMScheduler, UNet2DConditionModel
 
 from extrap_train.config import ModelConfig
-from extrap_train.diffusion.checkpoint import load_model, save_model, start_weights
+from extrap_train.diffusion.checkpoint import initial_model, load_model, save_model
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError
 
@@ -48,9 +48,9 @@ def test_half_precision_on_disk_leaves_the_model_alone(config: ModelConfig, tmp_
 
 def test_weights_of_another_shape_are_refused(config: ModelConfig, tmp_path: Path) -> None:
     save_model(ExtrapolationModel(config), tmp_path / "model")
-    other = ExtrapolationModel(replace(config, octaves=5))
-    with pytest.raises(InputError, match=r"does not fit the configured model.*conv_in"):
-        start_weights(other, str(tmp_path / "model"))
+    other = replace(config, octaves=5, start=str(tmp_path / "model"))
+    with pytest.raises(InputError, match=r"another network's.*conv_in"):
+        initial_model(other)
 
 
 @pytest.mark.parametrize("part", ["unet/diffusion_pytorch_model.safetensors", "image_encoder"])
@@ -83,4 +83,4 @@ def test_a_full_disk_leaves_the_older_model(
 
 def test_an_unknown_start_lists_what_there_is(config: ModelConfig) -> None:
     with pytest.raises(InputError, match=r"model\.start=nothing"):
-        start_weights(ExtrapolationModel(config), "nothing")
+        initial_model(replace(config, start="nothing"))

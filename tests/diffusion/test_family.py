@@ -10,6 +10,7 @@ from extrap_train.data.module import with_warp
 from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sample_views, view_generator
+from extrap_train.errors import InputError
 from extrap_train.views import PairBatch
 
 
@@ -92,3 +93,9 @@ def test_published_sampling_leaves_the_noisiest_step_out_and_guides_against_zero
     assert [timestep for timestep, _ in seen[:2]] == [961, 941]
     assert len(seen) == 49
     assert all(not token[3:].any() and token[:3].any() for _, token in seen)
+
+
+def test_views_of_another_size_are_refused(config: ModelConfig, batch: PairBatch) -> None:
+    model = _model(replace(config, image_size=64), "ours")
+    with pytest.raises(InputError, match=r"views of 32 x 32 pixels.*trained on 64 x 64: resize"):
+        model.condition(batch)

@@ -1,0 +1,96 @@
+"""Sampling a view with guidance: both predictions in one bfloat16 pass with fused attention,
+against plain float32, one after the other.
+"""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from benchmarks.perf.diffusion_case import (
+    Size,
+    batch_of,
+    configuration,
+    devices,
+    forward_flops,
+    optimised,
+    peak_mib,
+    plain,
+    report,
+)
+from benchmarks.perf.timing import Row, compare
+from extrap_train.config import SamplerConfig
+from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.sampler import sample_views, view_generator
+from extrap_train.views import PairBatch
+
+_GUIDANCE = 3.0
+_STEPS = {"cpu": 2, "cuda": 50}
+_REPEATS = {"cpu": 3, "cuda": 5}
+Sampling = Callable[[], Float[Tensor, "b 3 h w"]]
+
+
+def run() -> list[Row]:
+    """A row a device and batch size, on a GPU also with torch.compile; prints speed and memory."""
+    return [
+        _compare(device, size, count, compiled)
+        for device, size, counts in devices()
+        for count in counts
+        for compiled in ((False, True) if device.type == "cuda" else (False,))
+    ]
+
+
+def _compare(device: torch.device, size: Size, count: int, compiled: bool) -> Row:
+    config = configuration(size)
+    model, batch = optimised(config, device).eval(), batch_of(count, device)
+    steps = _STEPS[device.type]
+    reference = plain_sampling(plain(model), batch, steps)
+    if compiled:
+        model.unet.compile()
+    ours = sampling(model, batch, steps)
+    case = f"{steps} guided steps, {size.name}, batch {count}{', compiled' if compiled else ''}"
+    row = compare(case, device, ours, reference, _REPEATS[device.type])
+    flops = 2 * steps * count * forward_flops(config)
+    for name, run_once, taken in (
+        (case, ours, row.ours_ms),
+        ("  plain float32", reference, row.reference_ms),
+    ):
+        print(report(name, device, count, taken, peak_mib(device, run_once), flops))
+    return row
+
+
+def sampling(model: ExtrapolationModel, batch: PairBatch, steps: int) -> Sampling:
+    """The product's sampler under mixed precision, as validation runs it."""
+    options = SamplerConfig(steps=steps, guidance=_GUIDANCE)
+    device = batch.image.device
+
+    def sample() -> Float[Tensor, "b 3 h w"]:
+        generators = [view_generator(0, str(i)) for i in range(len(batch.image))]
+        with torch.autocast(device.type, torch.bfloat16):
+            return sample_views(model, batch, options, generators)
+
+    return sample
+
+
+def plain_sampling(model: ExtrapolationModel, batch: PairBatch, steps: int) -> Sampling:
+    """DDIM with guidance as one writes it down: two passes a step."""
+
+    @torch.no_grad()
+    def sample() -> Float[Tensor, "b 3 h w"]:
+        condition = model.condition(batch)
+        null = condition.zeroed(torch.ones_like(condition.token_weight, dtype=torch.bool))
+        draws = [
+            torch.randn(condition.base.shape[1:], generator=view_generator(0, str(i)))
+            for i in range(len(batch.image))
+        ]
+        latent = torch.stack(draws).to(condition.base)
+        model.schedule.set_timesteps(steps)
+        for timestep in model.schedule.timesteps:
+            times = torch.full((len(latent),), int(timestep), device=latent.device)
+            conditional, without = model(latent, times, condition), model(latent, times, null)
+            prediction = without + _GUIDANCE * (conditional - without)
+            latent = model.schedule.step(prediction, timestep, latent).prev_sample
+        return model.decode_target(latent, condition)
+
+    return sample

@@ -1,0 +1,138 @@
+"""Files and folders of published weights, as tensors under our names, complete or refused."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from extrap_train.config import ModelConfig
+from extrap_train.diffusion.published.names import (
+    CLIP_PREFIX,
+    PROJECTION_PREFIX,
+    UNET_PREFIX,
+    VAE_PREFIX,
+    origins,
+)
+from extrap_train.weight_files import WeightFile
+
+SOURCES = (
+    "ZeroNVS's .ckpt (https://huggingface.co/kylesargent/ZeroNVS), MegaScenes's iter_N folder "
+    "(https://github.com/MegaScenes/nvs) or a diffusers folder"
+)
+Shapes = Mapping[str, torch.Size]
+
+_LIGHTNING_REMARKS = (
+    "pytorch_lightning.callbacks.model_checkpoint.ModelCheckpoint",
+    "omegaconf.dictconfig.DictConfig",
+    "omegaconf.listconfig.ListConfig",
+    "omegaconf.base.ContainerMetadata",
+    "omegaconf.base.Metadata",
+    "omegaconf.nodes.AnyNode",
+    "typing.Any",
+)
+"""What the Lightning of those years wrote beside the tensors; read as inert remarks."""
+
+_CONTENT = {
+    UNET_PREFIX: "the denoiser",
+    VAE_PREFIX: "the autoencoder",
+    CLIP_PREFIX: "CLIP's image tower",
+    PROJECTION_PREFIX: "the projection of pose and image",
+}
+_FOLDER_FILES = {
+    "unet": ("diffusion_pytorch_model",),
+    "vae": ("diffusion_pytorch_model",),
+    "image_encoder": ("model", "pytorch_model"),
+    "cc_projection": ("model", "diffusion_pytorch_model", "pytorch_model"),
+}
+_SUFFIXES = (".safetensors", ".bin")
+_LISTED = 5
+
+
+def read_published(
+    path: Path, wanted: Mapping[str, Shapes], config: ModelConfig
+) -> dict[str, tuple[WeightFile, dict[str, Tensor]]]:
+    """Each part's tensors under our names, in the file's precision, with the file they are from.
+
+    `path` is one that `weights_at` gave.
+    `wanted` has the tensors of `unet`, `cc_projection`, `vae` and `image_encoder`, each one's
+    shape by its name. Raises InputError where the path holds no such weights, or not all of them.
+    """
+    if (path / "unet").is_dir():
+        return {part: _folder_part(path / part, part, shapes) for part, shapes in wanted.items()}
+    file = _weight_file(path)
+    state = file.tensors(file.read(_LIGHTNING_REMARKS), "state_dict")
+    parts = _from_latent_diffusion(file, state, wanted, config)
+    return {part: (file, tensors) for part, tensors in parts.items()}
+
+
+def weights_at(path: Path) -> Path | None:
+    """The diffusers folder or single file that a user's path leads to; None where there is none.
+
+    MegaScenes's `iter_N` folders hold a single file, named as accelerate's `save_state` names it.
+    """
+    if path.is_file() or (path / "unet").is_dir():
+        return path
+    inside = (path / name for name in ("model.safetensors", "pytorch_model.bin"))
+    return next((file for file in inside if file.is_file()), None)
+
+
+def _weight_file(path: Path) -> WeightFile:
+    return WeightFile(path, "model.start", SOURCES)
+
+
+def _folder_part(folder: Path, part: str, shapes: Shapes) -> tuple[WeightFile, dict[str, Tensor]]:
+    candidates = [folder / (n + s) for s in _SUFFIXES for n in _FOLDER_FILES[part]]
+    file = _weight_file(next((path for path in candidates if path.is_file()), candidates[0]))
+    state = file.tensors(file.read())
+    state.pop("vision_model.embeddings.position_ids", None)  # saved by older transformers
+    missing = [name for name in shapes if name not in state]
+    if missing:
+        raise file.refusal(_listed(missing, len(shapes), "is the folder of another network?"))
+    return file, state
+
+
+def _from_latent_diffusion(
+    file: WeightFile, state: dict[str, Tensor], wanted: Mapping[str, Shapes], config: ModelConfig
+) -> dict[str, dict[str, Tensor]]:
+    if all(name.startswith("module.") for name in state):  # saved from inside DDP
+        state = {name.removeprefix("module."): x for name, x in state.items()}
+    places = {part: origins(part, list(shapes), config) for part, shapes in wanted.items()}
+    names = list(dict.fromkeys(o.name for place in places.values() for o in place.values()))
+    missing = [name for name in names if name not in state]
+    if missing:
+        raise file.refusal(_listed(missing, len(names), _cause(state)))
+    strange = [n for n in state if n.startswith(tuple(_CONTENT)) and n not in set(names)]
+    if strange:
+        raise file.refusal(
+            f"holds {len(strange)} tensors more than this network ({_first(strange)}): "
+            "it is of another size than model.unet, model.vae and model.clip say"
+        )
+    return {
+        part: {name: place.made_by(state[place.name]) for name, place in by_name.items()}
+        for part, by_name in places.items()
+    }
+
+
+def _cause(state: Mapping[str, Tensor]) -> str:
+    """Why the tensors are probably missing."""
+    if any(name.startswith("cond_stage_model.transformer.") for name in state):
+        return "it is a text-to-image Stable Diffusion, not a model of this family"
+    gone = [
+        what
+        for prefix, what in _CONTENT.items()
+        if not any(name.startswith(prefix) for name in state)
+    ]
+    if len(gone) == len(_CONTENT):
+        return "its names are not those of a latent-diffusion checkpoint"
+    if gone:
+        return f"it was exported without {' and '.join(gone)}"
+    return "it is of another size than model.unet, model.vae and model.clip say, or was cut down"
+
+
+def _listed(missing: Sequence[str], total: int, cause: str) -> str:
+    return f"lacks {len(missing)} of {total} tensors ({_first(missing)}): {cause}"
+
+
+def _first(names: Sequence[str]) -> str:
+    return ", ".join(names[:_LISTED]) + (", …" if len(names) > _LISTED else "")

@@ -1,0 +1,41 @@
+"""A published network with what it was given and what it gave, and our configuration of it."""
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from extrap_train.config import ClipConfig, ModelConfig, UNetConfig, VaeConfig
+
+FAMILIES = ("zeronvs", "megascenes")
+TINY_UNET = UNetConfig(
+    channels=[32, 64, 128, 128],
+    layers_per_block=2,
+    attention_levels=[True, True, True, False],
+    heads=8,
+    token_width=768,
+    norm_groups=32,
+)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A published network, what it was given and what it gave."""
+
+    family: str
+    state: dict[str, Tensor]
+    expected: dict[str, Tensor]
+
+
+def tiny_config(family: str, **changed: object) -> ModelConfig:
+    options: dict[str, object] = {
+        "name": "tiny",
+        "family": family,
+        "image_size": 256,
+        "vae": VaeConfig(channels=[32, 64, 128, 128]),
+        "clip": ClipConfig(width=128, layers=2, heads=2),
+        "residual": False,
+        "prediction": "epsilon",
+        "zero_terminal_snr": False,
+        "unet": TINY_UNET,
+    }
+    return ModelConfig(**(options | changed))  # type: ignore[arg-type]

@@ -1,0 +1,56 @@
+"""The full-size configurations take the full-size layouts, tensor by tensor, without memory."""
+
+import json
+from pathlib import Path
+
+import hydra
+import pytest
+import torch
+from omegaconf import OmegaConf
+from torch import Tensor
+
+from extrap_train.cli import register_schemas
+from extrap_train.config import ModelConfig
+from extrap_train.diffusion.checkpoint import load_weights
+from extrap_train.diffusion.model import ExtrapolationModel
+
+
+def _configured(name: str) -> ModelConfig:
+    register_schemas()
+    with hydra.initialize_config_module("conf", version_base="1.3"):
+        composed = hydra.compose("train", ["category=hydrant", f"model={name}"])
+    typed = OmegaConf.to_object(composed.model)
+    assert isinstance(typed, ModelConfig)
+    return typed
+
+
+def _layout(folder: Path, family: str) -> dict[str, Tensor]:
+    def keys(name: str) -> dict[str, list[int]]:
+        return json.loads((folder / f"{name}.json").read_text())["keys"]
+
+    parts = [f"{family}_unet", "vae", "clip_image_encoder", "cc_projection"]
+    names = keys("zeronvs_full") if family == "zeronvs" else {}
+    for part in parts:
+        names |= keys(part)
+    return {name: torch.empty(shape, device="meta") for name, shape in names.items()}
+
+
+@pytest.mark.parametrize(
+    ("layout", "model", "denoiser_parameters"),
+    [
+        ("zeronvs", "zeronvs", 859_532_484),
+        ("megascenes", "megascenes", 859_541_124),
+        ("zeronvs", "ours", 859_532_484 + 320 * 9 * 37),
+    ],
+)
+def test_the_published_layout_loads(
+    shared: Path, tmp_path: Path, layout: str, model: str, denoiser_parameters: int
+) -> None:
+    torch.save({"state_dict": _layout(shared / "layouts", layout)}, tmp_path / "weights.ckpt")
+    with torch.device("meta"):
+        network = ExtrapolationModel(_configured(model))
+    load_weights(network, tmp_path / "weights.ckpt")
+    counted = {p: sum(x.numel() for x in n.parameters()) for p, n in network.parts().items()}
+    assert counted["unet"] == denoiser_parameters
+    assert counted["vae"] == 83_653_863
+    assert counted["cc_projection"] == 605_184
