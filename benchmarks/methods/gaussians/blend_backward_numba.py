@@ -10,6 +10,7 @@ import numpy as np
 
 from benchmarks.methods.gaussians.block_numba import (
     ACROSS,
+    BATCH,
     BEHIND,
     BLOCKS,
     COLORS,
@@ -24,11 +25,12 @@ from benchmarks.methods.gaussians.block_numba import (
     SIDE_BITS,
     ZERO,
     alpha_of,
+    gather,
     pixel_of,
     place,
-    sum_of,
 )
 from benchmarks.methods.gaussians.packed_numba import (
+    COLUMNS,
     FEATURES,
     LOG_OPACITY,
     MOMENTS,
@@ -91,18 +93,21 @@ def _tile_backward(
     for k in range(end, len(slots)):
         moments[slots[k]] = 0
     sums = np.empty(MOMENTS * LANES, packed.dtype)
-    for k in range(end - 1, -1, -1):
-        sums[:] = 0
-        ellipse = packed[gaussians[k]]
-        u, v, (first, last, top_row, bottom_row) = place(ellipse, top, left)
-        for row in range(top_row, bottom_row):
-            for column in range(first, last):
-                block = row * ACROSS + column
-                if k < ends[block]:
-                    center = (u - column * SIDE, v - row * SIDE)
-                    _block_backward(planes[block * LANES :], ellipse, center, k + 1, sums)
-        for i in range(MOMENTS):
-            moments[slots[k], i] = sum_of(sums[i * LANES :])
+    batch = np.empty((BATCH, COLUMNS), packed.dtype)
+    for stop in range(end, 0, -BATCH):
+        start = max(stop - BATCH, 0)
+        gather(packed, gaussians[start:stop], batch)
+        for k in range(stop - 1, start - 1, -1):
+            sums[:] = 0
+            ellipse = batch[k - start]
+            u, v, (first, last, top_row, bottom_row) = place(ellipse, top, left)
+            for row in range(top_row, bottom_row):
+                for column in range(first, last):
+                    block = row * ACROSS + column
+                    if k < ends[block]:
+                        center = (u - column * SIDE, v - row * SIDE)
+                        _block_backward(planes[block * LANES :], ellipse, center, k + 1, sums)
+            _add_lanes(sums, moments[slots[k]])
 
 
 @compiled(contract=True)
@@ -147,3 +152,15 @@ def _block_backward(
         sums[7 * LANES + j] += weight * two
         sums[8 * LANES + j] += weight * three
         sums[9 * LANES + j] += weight * four
+
+
+@compiled()
+def _add_lanes(sums: np.ndarray, moments: np.ndarray) -> None:
+    """Sum the lanes of each moment, halves first; `sums` is used up."""
+    for i in range(MOMENTS):
+        lanes = sums[i * LANES : (i + 1) * LANES]
+        for j in range(LANES // 2):
+            lanes[j] += lanes[j + LANES // 2]
+        for j in range(LANES // 4):
+            lanes[j] += lanes[j + LANES // 4]
+        moments[i] = (lanes[0] + lanes[2]) + (lanes[1] + lanes[3])

@@ -5,6 +5,7 @@ import numpy as np
 
 from benchmarks.methods.gaussians.block_numba import (
     ACROSS,
+    BATCH,
     BLOCKS,
     COLORS,
     END,
@@ -19,11 +20,12 @@ from benchmarks.methods.gaussians.block_numba import (
     SIDE_BITS,
     ZERO,
     alpha_of,
+    gather,
     pixel_of,
     place,
-    sum_of,
 )
 from benchmarks.methods.gaussians.packed_numba import (
+    COLUMNS,
     FEATURES,
     LOG_OPACITY,
     PRECISION,
@@ -33,8 +35,6 @@ from benchmarks.methods.gaussians.packed_numba import (
 from benchmarks.methods.gaussians.tiles_numba import TILE
 from extrap_train.geometry.compiled import compiled
 
-_CHECK_EVERY = 16
-"""Meetings after which to look which blocks are full."""
 _LEAST_LIGHT = np.float32(1e-4)
 """A pixel is full when the next ellipse would leave less light than this."""
 
@@ -76,16 +76,20 @@ def _blend_tile(
     packed: np.ndarray, gaussians: np.ndarray, top: int, left: int, planes: np.ndarray
 ) -> None:
     alive = np.ones(BLOCKS, np.bool_)
-    for k in range(len(gaussians)):
-        ellipse = packed[gaussians[k]]
-        u, v, (first, last, top_row, bottom_row) = place(ellipse, top, left)
-        for row in range(top_row, bottom_row):
-            for column in range(first, last):
-                block = row * ACROSS + column
-                if alive[block]:
-                    center = (u - column * SIDE, v - row * SIDE)
-                    _blend_block(planes[block * LANES :], ellipse, center, k + 1)
-        if k % _CHECK_EVERY == _CHECK_EVERY - 1 and not _find_alive(planes, alive):
+    batch = np.empty((BATCH, COLUMNS), packed.dtype)
+    for start in range(0, len(gaussians), BATCH):
+        end = min(start + BATCH, len(gaussians))
+        gather(packed, gaussians[start:end], batch)
+        for k in range(start, end):
+            ellipse = batch[k - start]
+            u, v, (first, last, top_row, bottom_row) = place(ellipse, top, left)
+            for row in range(top_row, bottom_row):
+                for column in range(first, last):
+                    block = row * ACROSS + column
+                    if alive[block]:
+                        center = (u - column * SIDE, v - row * SIDE)
+                        _blend_block(planes[block * LANES :], ellipse, center, k + 1)
+        if not _find_alive(planes, alive):
             return
 
 
@@ -122,7 +126,9 @@ def _find_alive(planes: np.ndarray, alive: np.ndarray) -> bool:
     """Mark the blocks that any light passes through, and say whether there are any."""
     some = False
     for block in range(len(alive)):
-        light = sum_of(planes[LIGHT + block * LANES :])
+        light = ZERO
+        for j in range(LANES):
+            light = max(light, planes[LIGHT + block * LANES + j])
         alive[block] = light > ZERO
-        some = some or light > ZERO
+        some = some or alive[block]
     return some

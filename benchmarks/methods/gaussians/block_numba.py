@@ -11,6 +11,7 @@ import numpy as np
 
 from benchmarks.methods.gaussians.packed_numba import (
     CHANNELS,
+    COLUMNS,
     LEAST_LOG,
     REACH,
     U,
@@ -31,6 +32,8 @@ LIGHT, LEFT, BEHIND, END, COLORS = 0, PIXELS, PIXELS, 2 * PIXELS, 3 * PIXELS
 is left at the end, or what lies behind as the loss sees it; the last meeting that counts, from 1;
 four colours, or their gradients. A tile's planes hold numbers of one type."""
 PLANES = 3 + CHANNELS
+BATCH = 16
+"""Ellipses that are fetched together, so that their cache misses overlap."""
 
 ZERO, ONE = np.float32(0), np.float32(1)
 MOST_ALPHA = np.float32(0.999)
@@ -81,10 +84,8 @@ def pixel_of(y: int, x: int) -> int:
 
 
 @compiled()
-def sum_of(lanes: np.ndarray) -> np.floating:
-    """Of one block."""
-    half = LANES // 2
-    total = lanes[0] + lanes[half]
-    for j in range(1, half):
-        total += lanes[j] + lanes[half + j]
-    return total
+def gather(packed: np.ndarray, gaussians: np.ndarray, batch: np.ndarray) -> None:
+    """Copy the ellipses of a batch."""
+    for k in range(len(gaussians)):
+        for c in range(COLUMNS):
+            batch[k, c] = packed[gaussians[k], c]

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from benchmarks.methods.gaussians.announce import announced_compilation
 from benchmarks.methods.gaussians.blend import blend_ellipses
 from benchmarks.methods.gaussians.projection import LOW_PASS, NEAR_PLANE, Ellipses, project
 from benchmarks.methods.gaussians.spherical_harmonics import sh_colors
@@ -40,6 +41,7 @@ def rasterizer(name: Backend) -> Rasterization:
     return partial(on_cuda, packed=False)
 
 
+@announced_compilation()
 def rasterization(
     means: Float[Tensor, "n 3"],
     quats: Float[Tensor, "n 4"],

@@ -1,6 +1,7 @@
 """Images and gradients against a brute-force renderer in double precision."""
 
 import brute_force
+import numba
 import pytest
 import torch
 from splats import camera_pose, pinhole, random_gaussians
@@ -9,6 +10,14 @@ from benchmarks.methods.gaussians.rasterization import rasterization
 from benchmarks.methods.gaussians.spherical_harmonics import sh_colors
 
 WIDTH, HEIGHT = 45, 38
+
+
+@pytest.fixture(autouse=True)
+def _one_numba_thread():
+    """Tiny scenes gain nothing from a second thread, and lose much on a busy machine."""
+    numba.set_num_threads(1)
+    yield
+    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
 
 
 def leaves(gaussians, pose, dtype):
@@ -176,8 +185,6 @@ def test_colors_of_a_camera_and_many_channels():
 
 
 def test_same_bits_on_any_number_of_threads():
-    import numba
-
     results = []
     for threads in (1, 2):
         numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
@@ -185,5 +192,4 @@ def test_same_bits_on_any_number_of_threads():
         image, _, _ = draw(inputs, "RGB+ED", 1)
         image.square().sum().backward()
         results.append([image, *(x.grad for x in inputs)])
-    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))

@@ -1,0 +1,47 @@
+"""The timed rasteriser draws and differentiates what its plain reference does."""
+
+import pytest
+import torch
+
+from benchmarks.methods.gaussians.rasterization import rasterizer
+from benchmarks.perf.gaussians import cube_of_gaussians
+from benchmarks.perf.gaussians_reference import rasterize_reference
+from benchmarks.perf.warp import orbit_camera
+from extrap_train.errors import InputError
+
+SIZE = 40
+
+
+def test_reference_is_equal():
+    inputs = [x.requires_grad_() for x in cube_of_gaussians(120)]
+    camera = orbit_camera(20.0, SIZE)
+    poses = (camera.world_to_cam[None], camera.intrinsics[None])
+    image = rasterizer("numba")(*inputs, *poses, SIZE, SIZE)[0][0]
+    reference = rasterize_reference(camera, *inputs)
+    assert torch.allclose(image, reference, atol=2e-4)  # full pixels go on in the reference
+    weight = torch.rand(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(0))
+    ours = torch.autograd.grad((image * weight).sum(), inputs)
+    theirs = torch.autograd.grad((reference * weight).sum(), inputs)
+    for a, b in zip(ours, theirs, strict=True):
+        assert (a - b).abs().max() < 1e-3 * b.abs().max()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="says what is missing without a GPU")
+def test_gsplat_without_a_gpu_is_one_line():
+    with pytest.raises(InputError, match="rasterizer=numba"):
+        rasterizer("gsplat")
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device and gsplat")
+def test_gsplat_is_equal():
+    inputs = [x.requires_grad_() for x in cube_of_gaussians(500)]
+    camera = orbit_camera(20.0, SIZE)
+    results = []
+    for name, device in (("numba", "cpu"), ("gsplat", "cuda")):
+        poses = (camera.world_to_cam[None].to(device), camera.intrinsics[None].to(device))
+        arguments = (*(x.to(device) for x in inputs), *poses, SIZE, SIZE)
+        image, alpha, _ = rasterizer(name)(*arguments, render_mode="RGB+ED")
+        drawn = torch.cat([image, alpha], -1).cpu()
+        results.append([drawn, *torch.autograd.grad(drawn.square().sum(), inputs)])
+    for a, b in zip(*results, strict=True):
+        assert (a - b).abs().max() < 1e-3 * b.abs().max()
