@@ -9,7 +9,7 @@ from pathlib import Path
 from extrap_train.config import CATEGORIES
 from extrap_train.errors import InputError
 
-PERF_NAMES = ("align", "gaussians", "sample", "train", "warp")
+PERF_NAMES = ("align", "depth", "gaussians", "sample", "train", "warp")
 LISTS = {"categories": CATEGORIES}
 
 

@@ -29,7 +29,12 @@ _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS)
 _GROUPS: dict[str, list[type]] = {
     "category": [schema.CategoryConfig],
     "data": [schema.SyntheticConfig, schema.Co3dConfig],
-    "depth": [schema.DatasetDepthConfig, schema.StereoConfig, schema.Mast3rConfig],
+    "depth": [
+        schema.DatasetDepthConfig,
+        schema.StereoConfig,
+        schema.Mast3rConfig,
+        schema.MonocularConfig,
+    ],
     "matcher": [
         schema.FlowMatcherConfig,
         schema.LoftrMatcherConfig,

@@ -41,6 +41,11 @@ def _error(arguments: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
         (["category=hydrant", "threads=0"], "threads=0: must be at least 1"),
         (["category=hydrant", "seed=-1"], "seed=-1: must be from 0"),
         (["category=hydrant", "depth=stereo", "depth.planes=1"], "depth.planes=1: must be from 2"),
+        (["category=hydrant", "depth=mast3r"], "depth.checkpoint is not given: give depth.check"),
+        (
+            ["category=hydrant", "depth=monocular", "matcher@depth.matcher=aliked"],
+            "depth.matcher.checkpoint is not given: give depth.matcher.checkpoint=FILE, aliked-n16",
+        ),
         (["category=hydrant", "model.patch=0"], "model.patch=0: must be from 1"),
         (["category=hydrant", "model.unet.channels=[30,60]"], "need multiples of 16"),
         (["category=hydrant", "trainer.precision=half"], "known: 32-true, bf16-mixed"),

@@ -25,7 +25,13 @@ from extrap_train.config.data import (
     PrepConfig,
     SyntheticConfig,
 )
-from extrap_train.config.depth import DatasetDepthConfig, DepthConfig, Mast3rConfig, StereoConfig
+from extrap_train.config.depth import (
+    DatasetDepthConfig,
+    DepthConfig,
+    Mast3rConfig,
+    MonocularConfig,
+    StereoConfig,
+)
 from extrap_train.config.launcher import LauncherConfig, LocalConfig, SlurmConfig
 from extrap_train.config.matching import (
     AlikedMatcherConfig,
@@ -71,6 +77,7 @@ __all__ = [
     "MatcherConfig",
     "MethodConfig",
     "ModelConfig",
+    "MonocularConfig",
     "PrepConfig",
     "QuickConfig",
     "RulesConfig",

@@ -24,6 +24,8 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "depth.planes": (2, 4096),
     "depth.neighbours": (1, 64),
     "depth.image_size": (16, 8192),
+    "depth.matcher.image_size": (16, 8192),
+    "depth.matcher.keypoints": (2, 20_000),
     "matcher.image_size": (16, 8192),
     "matcher.keypoints": (2, 20_000),
     "launcher.tasks": (1, 1_000_000),
@@ -84,15 +86,24 @@ def validate(config: TrainConfig | DataPrepConfig, tasks: tuple[str, ...]) -> No
     _check_prep(config.prep)
     if isinstance(config.data, Co3dConfig) and not config.data.root:
         raise InputError("data=co3d needs the folder of the download: give data.root=FOLDER")
-    for group in ("depth", "matcher"):
-        part: Any = getattr(config, group, None)
-        if hasattr(part, "checkpoint"):
-            required_file(part.checkpoint, f"{group}.checkpoint", part.weights)
+    _check_files(config)
     if isinstance(config, TrainConfig):
         _check_one_of("task", config.task, tasks)
         _check_one_of("trainer.precision", config.trainer.precision, _PRECISIONS)
         _check_model(config.model, config.prep)
         _check_sampler(config.sampler)
+
+
+def _check_files(config: TrainConfig | DataPrepConfig) -> None:
+    """Files of weights must be named before anything is computed that would want them."""
+    options: dict[str, Any] = {
+        "depth": config.depth,
+        "depth.matcher": getattr(config.depth, "matcher", None),
+        "matcher": getattr(config, "matcher", None),
+    }
+    for option, part in options.items():
+        if hasattr(part, "checkpoint"):
+            required_file(part.checkpoint, f"{option}.checkpoint", part.weights)
 
 
 def required_file(path: str | None, option: str, content: str) -> str:

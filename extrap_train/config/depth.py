@@ -1,8 +1,9 @@
 """Where depth comes from."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
+from extrap_train.config.matching import FlowMatcherConfig, MatcherConfig
 from extrap_train.config.tree import MISSING
 
 
@@ -51,3 +52,16 @@ class Mast3rConfig(DepthConfig):
     square: bool = False
     """Show square pictures whole; the published 512-pixel weights know 4:3 and wider only, to which
     squares are cut otherwise: no depth in their upper and lower eighth."""
+
+
+@dataclass
+class MonocularConfig(DepthConfig):
+    """Depth Anything, its scale and shift from matches at the known poses."""
+
+    name: str = "monocular"
+    model: str = "depth-anything/Depth-Anything-V2-Small-hf"
+    """Folder of a model for transformers, or a name in its cache of downloads."""
+    matcher: MatcherConfig = field(default_factory=FlowMatcherConfig)
+    """matcher@depth.matcher=aliked chooses another."""
+    neighbours: int = 4
+    """Most other views that a view is matched with."""

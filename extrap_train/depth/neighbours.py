@@ -14,6 +14,9 @@ NEAREST_RAD, FARTHEST_RAD = math.radians(6), math.radians(18)
 LEAST_RAD, LIMIT_RAD = math.radians(3), math.radians(45)
 """Outside, views never help in stereo: those of the same place agree at any depth."""
 
+WIDEST_RAD = math.radians(90)
+"""Limit of what matchers and learned point maps bridge."""
+
 
 def choose_neighbours(
     cameras: list[Camera],

@@ -1,6 +1,5 @@
 """Depth of posed views from a pairwise point-map network."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -13,12 +12,9 @@ from extrap_train.depth.fusion import fused
 from extrap_train.depth.mast3r.network import Encoding, PointMapNetwork
 from extrap_train.depth.mast3r.posed import posed_depths
 from extrap_train.depth.mast3r.preparation import Fit, fit, network_input
-from extrap_train.depth.neighbours import choose_neighbours
+from extrap_train.depth.neighbours import WIDEST_RAD, choose_neighbours
 from extrap_train.errors import InputError
 from extrap_train.views import Camera, View, combine
-
-WIDEST_RAD = math.radians(90)
-"""Between two views of a pair, seen from the scene's centre."""
 
 
 @dataclass(frozen=True)

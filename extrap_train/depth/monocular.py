@@ -1,0 +1,149 @@
+"""Depth of single pictures, set right by what matches in other views say at a few points."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from extrap_train.config import MonocularConfig
+from extrap_train.depth import DepthMap, PointMaps, point_maps_of
+from extrap_train.depth.depth_range import convergence_point
+from extrap_train.depth.line_fit import robust_line
+from extrap_train.depth.neighbours import WIDEST_RAD, choose_neighbours
+from extrap_train.errors import InputError
+from extrap_train.geometry.triangulation import triangulate
+from extrap_train.matching import Matcher
+from extrap_train.views import View, combine
+
+LEAST_PARALLAX_RAD = 0.02
+"""About 1°: below it a match says little of depth."""
+LARGEST_ERROR = 0.003
+"""From the epipolar line, as a share of the picture's longer side; at least a pixel."""
+LEAST_POINTS = 20
+EXPLAINED = 0.05
+"""Relative error of depth up to which a triangulated point agrees."""
+
+
+FARTHEST = 3.0
+"""Multiple of the farthest known point beyond which the line says nothing of depth."""
+
+
+@dataclass(frozen=True)
+class _Points:
+    """Pixels of a view with their depth, and how far to trust it."""
+
+    pixels: Float[Tensor, "n 2"]
+    depth: Float[Tensor, "n"]
+    weights: Float[Tensor, "n"]
+
+
+@runtime_checkable
+class InverseDepthNetwork(Protocol):
+    """What a single picture says."""
+
+    @property
+    def image_size(self) -> int:
+        """Side, in pixels, of what the network sees."""
+        ...
+
+    def inverse_depth(self, image: Float[Tensor, "3 h w"]) -> Float[Tensor, "h w"]:
+        """Greater is nearer, up to scale and shift."""
+        ...
+
+
+@dataclass(frozen=True)
+class MonocularDepth:
+    """1/z = scale · network + shift, both from triangulated matches at the known poses.
+
+    Confidence is the share of those matches whose depth the result explains within 5 %: one number
+    a view, 0 where the line leaves depth without meaning.
+    """
+
+    config: MonocularConfig
+    network: InverseDepthNetwork = field(repr=False, compare=False)
+    matcher: Matcher
+
+    @property
+    def image_size(self) -> int:
+        """Longer side that depth is estimated at, in pixels."""
+        return self.network.image_size
+
+    def point_maps(self, first: View, second: View) -> PointMaps:
+        """Both views' points in the first camera's frame.
+
+        InputError if the two have too few matches.
+        """
+        one, two = self.depth_map(first, [second]), self.depth_map(second, [first])
+        return point_maps_of(first, one, second, two)
+
+    def depth_map(self, view: View, neighbours: Sequence[View]) -> DepthMap:
+        """One view's depth; the neighbours give it scale and shift.
+
+        InputError if too few points of it are found in them.
+        """
+        helpers = self._neighbours([view, *neighbours])[0]
+        found = self._aligned(view, [neighbours[i - 1] for i in helpers])
+        if found is None:
+            raise InputError(
+                f"{view.name or 'a view'}: fewer than {LEAST_POINTS} of its points are found in "
+                "other views, which depth=monocular needs for scale and shift; add photographs or "
+                "choose another depth.matcher"
+            )
+        return found
+
+    def depth_maps(self, views: Sequence[View]) -> list[DepthMap]:
+        """The depth of every view; 0, unknown, where too few points are found in the others."""
+        maps = [
+            self._aligned(view, [views[j] for j in helpers])
+            for view, helpers in zip(views, self._neighbours(views), strict=True)
+        ]
+        return [
+            DepthMap(*torch.zeros_like(view.image[:2])) if found is None else found
+            for view, found in zip(views, maps, strict=True)
+        ]
+
+    def _neighbours(self, views: Sequence[View]) -> list[list[int]]:
+        cameras = [view.camera for view in views]
+        center = convergence_point(cameras)
+        return choose_neighbours(cameras, center, self.config.neighbours, WIDEST_RAD)
+
+    def _aligned(self, view: View, helpers: Sequence[View]) -> DepthMap | None:
+        """None where too few points are found, or nearness does not grow with the network's."""
+        parts = [self._points(view, helper) for helper in helpers]
+        if sum(len(part.depth) for part in parts) < LEAST_POINTS:
+            return None
+        points = combine(parts, lambda tensors: torch.cat(list(tensors)))
+        predicted = self.network.inverse_depth(view.image)
+        at_points = _sample(predicted, points.pixels)
+        line = robust_line(at_points, 1 / points.depth, points.weights)
+        if line is None or line.slope <= 0:
+            return None
+        explained = (line(at_points) * points.depth - 1).abs() <= EXPLAINED
+        inverse = line(predicted)
+        near_enough = inverse > 1 / (FARTHEST * points.depth.max())
+        confidence = explained.float().mean() * near_enough
+        return DepthMap(torch.where(near_enough, 1 / inverse, 0), confidence)
+
+    def _points(self, view: View, helper: View) -> _Points:
+        matches = self.matcher.match(view.image, helper.image)
+        found = triangulate(matches.first, matches.second, view.camera, helper.camera)
+        largest = max(1.0, LARGEST_ERROR * max(view.image.shape[1:]))
+        good = (found.depth > 0) & (found.error <= largest)
+        good &= found.parallax_rad >= LEAST_PARALLAX_RAD
+        # The error of an inverse depth is the pixel's over the parallax.
+        weights = matches.confidence * found.parallax_rad.square()
+        return _Points(matches.first[good], found.depth[good], weights[good])
+
+
+def _sample(values: Float[Tensor, "h w"], pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
+    size = pixels.new_tensor([values.shape[1], values.shape[0]])
+    return functional.grid_sample(
+        values[None, None],
+        (pixels / size * 2 - 1)[None, None],
+        padding_mode="border",
+        align_corners=False,
+    )[0, 0, 0]

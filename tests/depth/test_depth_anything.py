@@ -1,0 +1,112 @@
+"""A tiny untrained model in transformers' layout: what is read, and what is refused."""
+
+import json
+import os
+import re
+
+import pytest
+import torch
+from transformers import (
+    DepthAnythingConfig,
+    DepthAnythingForDepthEstimation,
+    Dinov2Config,
+    DPTImageProcessor,
+)
+
+from extrap_train.config import MonocularConfig
+from extrap_train.depth.build import depth_source
+from extrap_train.depth.depth_anything import read_depth_anything
+from extrap_train.depth.monocular import MonocularDepth
+from extrap_train.errors import InputError
+
+
+@pytest.fixture
+def folder(tmp_path):
+    torch.manual_seed(0)
+    backbone = Dinov2Config(
+        hidden_size=16,
+        num_hidden_layers=4,
+        num_attention_heads=2,
+        image_size=56,
+        patch_size=14,
+        out_features=["stage1", "stage2", "stage3", "stage4"],
+        reshape_hidden_states=False,
+        apply_layernorm=True,
+    )
+    config = DepthAnythingConfig(
+        backbone_config=backbone,
+        reassemble_hidden_size=16,
+        neck_hidden_sizes=[4, 4, 8, 8],
+        fusion_hidden_size=8,
+        head_hidden_size=4,
+    )
+    DepthAnythingForDepthEstimation(config).save_pretrained(tmp_path)
+    DPTImageProcessor(
+        size={"height": 56, "width": 56}, ensure_multiple_of=14, keep_aspect_ratio=True
+    ).save_pretrained(tmp_path)
+    return tmp_path
+
+
+def test_a_folder_becomes_a_source_and_pictures_keep_their_size(folder):
+    source = depth_source(MonocularConfig(model=str(folder)))
+    assert isinstance(source, MonocularDepth)
+    assert source.image_size == 56
+    assert "DepthAnythingForDepthEstimation" not in repr(source)
+    image = torch.rand(3, 40, 70, generator=torch.Generator().manual_seed(0))
+    found = source.network.inverse_depth(image)
+    assert found.shape == (40, 70)
+    assert found.isfinite().all()
+
+
+def test_metric_models_are_turned_into_inverse_depth(folder):
+    image = torch.rand(3, 56, 56, generator=torch.Generator().manual_seed(0))
+    relative = read_depth_anything(str(folder)).inverse_depth(image)
+    path = folder / "config.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"depth_estimation_type": "metric"}))
+    metric = read_depth_anything(str(folder))
+    with torch.no_grad():
+        pixels = metric.processor(images=image, do_rescale=False, return_tensors="pt")
+        depth = metric.network(pixel_values=pixels["pixel_values"]).predicted_depth[0]
+    assert not torch.allclose(relative, metric.inverse_depth(image))
+    torch.testing.assert_close(metric.inverse_depth(image), 1 / depth)
+
+
+def test_a_size_of_its_own_for_the_network_does_not_shift_the_picture(folder):
+    image = torch.rand(3, 56, 84, generator=torch.Generator().manual_seed(0))
+    found = read_depth_anything(str(folder)).inverse_depth(image)
+    assert found.shape == (56, 84)
+
+
+def refused(model, said):
+    with pytest.raises(InputError, match=re.escape(said)) as raised:
+        depth_source(MonocularConfig(model=str(model)))
+    message = str(raised.value)
+    assert "\n" not in message
+    assert str(model) in message
+    assert "depth.model=FOLDER" in message
+    assert "huggingface.co/depth-anything" in message
+
+
+def test_absent(tmp_path):
+    refused(tmp_path / "nowhere", "cannot be read")
+    refused("nobody/no-such-model", "cannot be read")
+
+
+def test_another_model(folder):
+    path = folder / "config.json"
+    path.write_text(json.dumps({"model_type": "dinov2"}))
+    refused(folder, "is a model of kind dinov2")
+
+
+def test_truncated_or_incomplete_weights(folder):
+    weights = folder / "model.safetensors"
+    content = json.loads((folder / "config.json").read_text())
+    more = content | {"neck_hidden_sizes": [4, 4, 8, 16]}
+    (folder / "config.json").write_text(json.dumps(more))
+    refused(folder, "depth.model=FOLDER")
+    (folder / "config.json").write_text(json.dumps(content))
+    os.truncate(weights, weights.stat().st_size // 2)
+    refused(folder, "cannot be read")
+    weights.unlink()
+    torch.save({}, folder / "pytorch_model.bin")  # pickles are not read
+    refused(folder, "cannot be read")
