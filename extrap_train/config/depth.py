@@ -1,9 +1,9 @@
 """Where depth comes from."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar
 
-from extrap_train.config.matching import FlowMatcherConfig, MatcherConfig
+from extrap_train.config.matching import MatcherConfig
 from extrap_train.config.tree import MISSING
 
 
@@ -61,7 +61,7 @@ class MonocularConfig(DepthConfig):
     name: str = "monocular"
     model: str = "depth-anything/Depth-Anything-V2-Small-hf"
     """Folder of a model for transformers, or a name in its cache of downloads."""
-    matcher: MatcherConfig = field(default_factory=FlowMatcherConfig)
+    matcher: MatcherConfig = MISSING
     """matcher@depth.matcher=aliked chooses another."""
     neighbours: int = 4
     """Most other views that a view is matched with."""

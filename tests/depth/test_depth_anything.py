@@ -13,7 +13,7 @@ from transformers import (
     DPTImageProcessor,
 )
 
-from extrap_train.config import MonocularConfig
+from extrap_train.config import FlowMatcherConfig, MonocularConfig
 from extrap_train.depth.build import depth_source
 from extrap_train.depth.depth_anything import read_depth_anything
 from extrap_train.depth.monocular import MonocularDepth
@@ -48,7 +48,7 @@ def folder(tmp_path):
 
 
 def test_a_folder_becomes_a_source_and_pictures_keep_their_size(folder):
-    source = depth_source(MonocularConfig(model=str(folder)))
+    source = depth_source(MonocularConfig(model=str(folder), matcher=FlowMatcherConfig()))
     assert isinstance(source, MonocularDepth)
     assert source.image_size == 56
     assert "DepthAnythingForDepthEstimation" not in repr(source)
@@ -79,7 +79,7 @@ def test_a_size_of_its_own_for_the_network_does_not_shift_the_picture(folder):
 
 def refused(model, said):
     with pytest.raises(InputError, match=re.escape(said)) as raised:
-        depth_source(MonocularConfig(model=str(model)))
+        depth_source(MonocularConfig(model=str(model), matcher=FlowMatcherConfig()))
     message = str(raised.value)
     assert "\n" not in message
     assert str(model) in message
