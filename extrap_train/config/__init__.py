@@ -58,7 +58,6 @@ __all__ = [
     "FAMILIES",
     "LPIPS_NETS",
     "MISSING",
-    "NORM_GROUPS",
     "AlikedMatcherConfig",
     "CapturesConfig",
     "CategoryConfig",

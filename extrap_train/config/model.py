@@ -60,6 +60,10 @@ class ModelConfig:
     """Most references that a view is warped from (paper III-A.4)."""
     octaves: int = 4
     """Of the positional encoding: 4 channels each."""
+    geometry: bool = False
+    """Tell the denoiser the warp's depth and confidence, too; `ours` only. It then has two more
+    input channels, which the packaged base lacks: give model.start=null.
+    """
     residual: bool = True
     """Denoise the difference to the hole-filled warp instead of the image itself; `ours` only."""
     prediction: str = "sample"

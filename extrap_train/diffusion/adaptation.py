@@ -17,8 +17,11 @@ from extrap_train.diffusion.loss import diffusion_loss, prediction_errors
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.schedule import solver_of
 
-_DRAWS = 4
+_DRAWS = 8
 """Of noise, at every level at which the held-out pair is measured."""
+_WARMUP = 20
+"""Steps until the full learning rate."""
+_AVERAGE_DECAY = 0.95
 
 
 @dataclass(frozen=True)
@@ -50,27 +53,35 @@ def adapt(
 ) -> Adaptation:
     """Train the adapter and leave its best weights upon the model.
 
-    The best are those with the least error on the held-out pair, measured with fixed noise at the
-    levels that the sampler steps through. `on_step` hears of every step and the share of the budget
-    that is spent. Steps are a function of the seed; how many there are depends on the clock.
+    Candidates are moving averages: the base is one, and single steps away from it are noisier than
+    what they learn. The best has the least error on the held-out pair, measured with fixed noise at
+    the levels that the sampler steps through. `on_step` hears of every step and the share of the
+    budget that is spent. Steps are a function of the seed; how many depends on the clock.
     """
     started = clock()
     trained = [weight for weight in model.parameters() if weight.requires_grad]
     optimizer = torch.optim.AdamW(trained, lr=options.learning_rate, weight_decay=0.0)
     measure = _HeldOut(model, pairs, sampler, fabric)
     losses = [(0, measure())]
+    average = _weights(adapter)
     best, best_step = _weights(adapter), 0
     step, ended = 0, "steps"
     while step < options.steps:
+        optimizer.param_groups[0]["lr"] = options.learning_rate * min(1.0, (step + 1) / _WARMUP)
         _train_step(model, pairs, options, optimizer, seed, step, fabric)
         step += 1
+        newest = _weights(adapter)
+        for name, value in average.items():
+            value.lerp_(newest[name], 1 - min(_AVERAGE_DECAY, (1 + step) / (10 + step)))
         spent = (clock() - started) / seconds
         on_step(step, spent)
         if step % options.validate_every and spent < 1:
             continue
+        peft.set_peft_model_state_dict(adapter, average)
         losses.append((step, measure()))
         if losses[-1][1] < min(loss for _, loss in losses[:-1]):
             best, best_step = _weights(adapter), step
+        peft.set_peft_model_state_dict(adapter, newest)
         if spent >= 1:
             ended = "time"
             break

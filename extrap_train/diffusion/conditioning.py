@@ -1,8 +1,9 @@
 """What the denoiser is told about the query view (METHOD section 3; paper II-B).
 
 Input channels of `model.family=ours`, in order: `noisy latent | reference latent | warped-image
-latent | PE(reference) | PE(warped) | mask`, all at the latents' resolution, and one cross-attention
-token from the reference's embedding and the relative pose. `family` has the other families.
+latent | PE(reference) | PE(warped) | mask`, with `model.geometry` `| depth | confidence` behind
+them, all at the latents' resolution, and one cross-attention token from the reference's embedding
+and the relative pose. `family` has the other families.
 """
 
 from dataclasses import dataclass, replace
@@ -71,9 +72,9 @@ def _zeroed(
     return channels * (~dropped).to(channels.dtype)[(...,) + (None,) * (channels.ndim - 2)]
 
 
-def condition_channels(latent_channels: int, octaves: int) -> int:
+def condition_channels(latent_channels: int, octaves: int, geometry: bool = False) -> int:
     """Channels of `Conditioning.latents`."""
-    return 2 * latent_channels + 2 * 4 * octaves + 1
+    return 2 * latent_channels + 2 * 4 * octaves + 1 + (2 if geometry else 0)
 
 
 def filled_warp(warp: Warp) -> Float[Tensor, "b 3 h w"]:
@@ -99,6 +100,23 @@ def concatenated_latents(
         functional.avg_pool2d(batch.warp.mask[:, None], autoencoder.factor),
     ]
     return torch.cat(channels, 1), warped
+
+
+def geometry_channels(
+    warp: Warp, scale: Float[Tensor, " b"], factor: int
+) -> Float[Tensor, "b 2 h w"]:
+    """Warped depth and confidence for a denoiser that is told them (`model.geometry`).
+
+    Depth as `scale` / depth, in [0, 2], averaged over each latent's known pixels, 0 in holes;
+    confidence is the splat's coverage in [0, 1], which fades towards the rim of a hole and where a
+    surface was seen at a slant.
+    """
+    known = warp.mask[:, None]
+    nearness = (scale[:, None, None] / warp.depth.clamp_min(1e-6)).clamp(0, 2)[:, None] * known
+    share = functional.avg_pool2d(known, factor)
+    mean = functional.avg_pool2d(nearness, factor) / share.clamp_min(1e-6)
+    coverage = functional.avg_pool2d(warp.weight[:, None].clamp(0, 1), factor)
+    return torch.cat([mean, coverage], 1)
 
 
 def _encode_warped(warp: Warp, octaves: int, factor: int) -> Float[Tensor, "b c h w"]:

@@ -19,7 +19,12 @@ from torch import Tensor
 
 from extrap_train.config import ModelConfig
 from extrap_train.diffusion.autoencoder import Autoencoder
-from extrap_train.diffusion.conditioning import Null, concatenated_latents, condition_channels
+from extrap_train.diffusion.conditioning import (
+    Null,
+    concatenated_latents,
+    condition_channels,
+    geometry_channels,
+)
 from extrap_train.diffusion.pose_encoding import depth_scale, megascenes_pose, zeronvs_pose
 from extrap_train.geometry.resample import lanczos_resize
 from extrap_train.geometry.warp import warp_references
@@ -113,13 +118,17 @@ class Ours:
 
     def channels(self, latent_channels: int, config: ModelConfig) -> int:
         """See `Family.channels`."""
-        return condition_channels(latent_channels, config.octaves)
+        return condition_channels(latent_channels, config.octaves, config.geometry)
 
     def latents(
         self, batch: PairBatch, autoencoder: Autoencoder, config: ModelConfig
     ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b z h w"]]:
         """See `Family.latents`."""
         latents, warped = concatenated_latents(batch, autoencoder, config.octaves)
+        if config.geometry:
+            assert batch.warp is not None
+            told = geometry_channels(batch.warp, _zeronvs_scale(batch), autoencoder.factor)
+            latents = torch.cat([latents, told], 1)
         return latents, warped if config.residual else torch.zeros_like(warped)
 
     def pose(self, batch: PairBatch) -> Float[Tensor, "b 19"]:
@@ -135,5 +144,8 @@ FAMILIES: dict[str, Family] = {"zeronvs": ZeroNvs(), "megascenes": MegaScenes(),
 
 
 def _zeronvs_pose(batch: PairBatch) -> Float[Tensor, "b 19"]:
-    scale = depth_scale(batch.reference_depths[:, 0], every=4, least=1e-2)
-    return zeronvs_pose(batch.reference_cameras[:, 0], batch.camera, scale)
+    return zeronvs_pose(batch.reference_cameras[:, 0], batch.camera, _zeronvs_scale(batch))
+
+
+def _zeronvs_scale(batch: PairBatch) -> Float[Tensor, " b"]:
+    return depth_scale(batch.reference_depths[:, 0], every=4, least=1e-2)

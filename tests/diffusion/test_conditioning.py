@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import torch
 
+from extrap_train.config import ModelConfig
 from extrap_train.data.module import with_warp
 from extrap_train.diffusion.autoencoder import PixelPatches
 from extrap_train.diffusion.conditioning import (
@@ -14,7 +15,9 @@ from extrap_train.diffusion.conditioning import (
     concatenated_latents,
     condition_channels,
     filled_warp,
+    geometry_channels,
 )
+from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.geometry.encoding import coordinate_grid, positional_encoding
 from extrap_train.views import PairBatch
 
@@ -102,3 +105,23 @@ def test_plain_zeros_silence_the_token_and_every_channel() -> None:
     null = one.doubled(plain_zeros=True)
     assert not null.latents[2:].any()
     assert null.token_weight.tolist() == [1, 1, 0, 0]
+
+
+def test_geometry_is_told_in_units_of_the_scene_and_is_zero_in_holes(
+    config: ModelConfig, batch: PairBatch
+) -> None:
+    assert batch.warp is not None
+    told = geometry_channels(batch.warp, torch.full((3,), 2.0), 2)
+    mask = torch.nn.functional.avg_pool2d(batch.warp.mask[:, None], 2)
+    whole = mask == 1
+    expected = torch.nn.functional.avg_pool2d(2.0 / batch.warp.depth.clamp_min(1e-6)[:, None], 2)
+    torch.testing.assert_close(told[:, :1][whole], expected[whole])
+    assert not told[:, :1][mask == 0].any()
+    assert 0 <= told[:, 1].min() <= told[:, 1].max() <= 1
+    larger = replace(batch.warp, depth=7 * batch.warp.depth)
+    torch.testing.assert_close(geometry_channels(larger, torch.full((3,), 14.0), 2), told)
+    model = ExtrapolationModel(replace(config, geometry=True))
+    plain = ExtrapolationModel(config).condition(batch).latents
+    latents = model.condition(batch).latents
+    assert torch.equal(latents[:, :-2], plain), "the further channels come last"
+    assert model.unet.config.in_channels == 12 + latents.shape[1]
