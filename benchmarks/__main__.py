@@ -1,57 +1,188 @@
-"""`benchmark`: comparisons with reference implementations, and what there is to compare."""
+"""`benchmark`: comparison tables of methods, and our kernels against reference implementations."""
 
 import argparse
 import importlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from benchmarks.catalogue import Catalogue
 from extrap_train.config import CATEGORIES
 from extrap_train.errors import InputError
 
 PERF_NAMES = ("align", "depth", "gaussians", "sample", "train", "warp")
-LISTS = {"categories": CATEGORIES}
+KINDS = ("methods", "tables", "categories")
+FORMATS = ("csv", "md", "latex", "html")
+
+Command = Callable[[argparse.Namespace], int]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status."""
-    options = _parser().parse_args(arguments)
+    options = _parsed(arguments)
     try:
-        if options.command == "perf":
-            _perf([options.name] if options.name else PERF_NAMES, Path(options.output))
-        else:
-            _list([options.kind] if options.kind else list(LISTS))
+        status: int = options.run(options)
+        return status
     except (InputError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    return 0
+    except KeyboardInterrupt:
+        print("interrupted: run the same command again to go on", file=sys.stderr)
+        return 130
+
+
+def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Overrides may stand before, between and after the options."""
+    parser = _parser()
+    options, rest = parser.parse_known_args(arguments)
+    strange = [word for word in rest if word.startswith("-") or "overrides" not in options]
+    if strange:
+        parser.error(f"unrecognized arguments: {' '.join(strange)}")
+    if rest:
+        options.overrides = [*options.overrides, *rest]
+    return options
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="benchmark", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    perf = commands.add_parser("perf", help="time our kernels against plain implementations")
+
+    def command(
+        name: str, run: Callable[[argparse.Namespace], int], text: str
+    ) -> argparse.ArgumentParser:
+        sub = commands.add_parser(name, help=text, description=text)
+        sub.set_defaults(run=run)
+        return sub
+
+    def with_table(sub: argparse.ArgumentParser) -> None:
+        sub.add_argument("table", help="a name of `benchmark list tables`")
+        sub.add_argument("overrides", nargs="*", metavar="key=value", help="e.g. methods=[ours]")
+        _add_config_dir(sub)
+
+    listing = command("list", _list, "what there is")
+    listing.add_argument("kind", nargs="?", choices=KINDS, help="default: all")
+    _add_config_dir(listing)
+    run = command("run", _run, "make a table: what is there is used, what has failed tried again")
+    with_table(run)
+    run.add_argument("--quick", action="store_true", help="the part that the table calls quick")
+    run.add_argument("--dry-run", action="store_true", help="what would run, and how long")
+    where = run.add_mutually_exclusive_group()
+    where.add_argument("--workers", type=_positive, default=0, metavar="N", help="default: cores")
+    where.add_argument("--slurm", action="store_true", help="as a SLURM job array")
+    report = command("report", _report, "write a table's reports again")
+    with_table(report)
+    report.add_argument("--format", choices=FORMATS, help="default: all")
+    verify = command("verify", _verify, "compute every number anew from the saved images")
+    verify.add_argument("results", help="folder of a table's results")
+    compare = command("compare", _compare, "two result sets of one protocol, with intervals")
+    compare.add_argument("before", help="folder of a table's results")
+    compare.add_argument("after", help="folder of a table's results")
+    perf = command("perf", _perf, "time our kernels against plain implementations")
     perf.add_argument("name", nargs="?", choices=PERF_NAMES, help="default: all")
     perf.add_argument("--output", default="perf", help="folder of the CSV files (default: perf)")
-    listing = commands.add_parser("list", help="what there is")
-    listing.add_argument("kind", nargs="?", choices=sorted(LISTS), help="default: all")
     return parser
 
 
-def _perf(names: Sequence[str], folder: Path) -> None:
-    for name in names:
-        # torch loads here, not for --help.
+def _add_config_dir(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--config-dir",
+        action="append",
+        default=[],
+        metavar="DIR",
+        help="folder with method/ and table/ of one's own; files in it can be imported",
+    )
+
+
+def _positive(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text} is no positive number")
+    return int(text)
+
+
+def _list(options: argparse.Namespace) -> int:
+    catalogue = Catalogue.with_own(options.config_dir)
+    for kind in [options.kind] if options.kind else KINDS:
+        if kind == "categories":
+            print(f"categories: {' '.join(CATEGORIES)}")
+            continue
+        print(f"{kind}:")
+        for name in catalogue.names(kind.removesuffix("s")):
+            print(f"  {name:<20} {_description(catalogue, kind, name)}")
+    return 0
+
+
+def _description(catalogue: Catalogue, kind: str, name: str) -> str:
+    if kind == "tables":
+        table = catalogue.table(name)
+        return f"{table.title}: {', '.join(table.methods)}"
+    method = catalogue.method(name)
+    return method.title + (f" (needs {method.needs})" if method.needs else "")
+
+
+# The rest imports torch: only when it is asked for.
+
+
+def _run(options: argparse.Namespace) -> int:
+    catalogue = Catalogue.with_own(options.config_dir)
+    table = catalogue.table(options.table, options.overrides)
+    for name in table.methods:
+        catalogue.method(name)  # a typing error is told before anything heavy loads
+    from benchmarks.runner import RunOptions, run_table
+
+    run = RunOptions(options.quick, options.dry_run, options.workers, options.slurm)
+    failed = run_table(table, catalogue, run)
+    if failed:
+        print(f"{failed} cells have failed; the same command tries them again", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def _report(options: argparse.Namespace) -> int:
+    catalogue = Catalogue.with_own(options.config_dir)
+    table = catalogue.table(options.table, options.overrides)
+    from benchmarks.plan import TableFolder
+    from benchmarks.report import write_reports
+    from benchmarks.results import read_results
+
+    folder = TableFolder(Path(table.output) / table.name)
+    formats = (options.format,) if options.format else FORMATS
+    for path in write_reports(read_results(folder), catalogue, folder, formats):
+        print(f"written: {path}")
+    return 0
+
+
+def _verify(options: argparse.Namespace) -> int:
+    from benchmarks.plan import TableFolder
+    from benchmarks.verify import verify
+
+    checked, problems = verify(TableFolder(Path(options.results)))
+    for problem in problems:
+        print(problem, file=sys.stderr)
+    if problems:
+        print(f"error: {len(problems)} mismatches in {options.results}", file=sys.stderr)
+        return 1
+    print(f"{checked} cells verified: every number follows from the saved images")
+    return 0
+
+
+def _compare(options: argparse.Namespace) -> int:
+    from benchmarks.compare import compare
+    from benchmarks.plan import TableFolder
+
+    table = compare(TableFolder(Path(options.before)), TableFolder(Path(options.after)))
+    print(table.to_string(index=False, float_format=lambda value: f"{value:.4f}"))
+    return 0
+
+
+def _perf(options: argparse.Namespace) -> int:
+    for name in [options.name] if options.name else PERF_NAMES:
         module = importlib.import_module(f"benchmarks.perf.{name}")
         timing = importlib.import_module("benchmarks.perf.timing")
         rows = module.run()
         timing.print_rows(rows)
-        timing.write_rows(rows, folder / f"{name}.csv")
-        print(f"written to {folder / f'{name}.csv'}")
-
-
-def _list(kinds: Sequence[str]) -> None:
-    for kind in kinds:
-        print(f"{kind}: {' '.join(LISTS[kind])}")
+        file = Path(options.output) / f"{name}.csv"
+        timing.write_rows(rows, file)
+        print(f"written to {file}")
+    return 0
 
 
 if __name__ == "__main__":

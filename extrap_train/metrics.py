@@ -2,6 +2,8 @@
 number an image.
 """
 
+import math
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,7 +16,16 @@ from torch import Tensor
 from extrap_train.errors import InputError
 from extrap_train.weight_files import WeightFile
 
-_SQUEEZENET = "squeezenet1_1-b8a52dc0.pth"
+Distance = Callable[[Tensor, Tensor], Tensor]
+"""Predictions and truths, `b 3 h w` in [0, 1], to a number each."""
+
+_VGG16 = "vgg16-397923af.pth"
+_BACKBONES = {
+    "alex": "alexnet-owt-7be5be79.pth",
+    "vgg": _VGG16,
+    "squeeze": "squeezenet1_1-b8a52dc0.pth",
+}
+"""torchvision's files, by LPIPS's names."""
 
 
 def quantised(image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
@@ -35,12 +46,18 @@ def psnr(
 
 
 def ssim(
-    prediction: Float[Tensor, "b 3 h w"], truth: Float[Tensor, "b 3 h w"]
+    prediction: Float[Tensor, "b 3 h w"],
+    truth: Float[Tensor, "b 3 h w"],
+    mask: Float[Tensor, "b h w"] | None = None,
 ) -> Float[Tensor, " b"]:
-    """Structural similarity as published: 11×11 Gaussian window, population covariance."""
-    pairs = zip(_arrays(prediction), _arrays(truth), strict=True)
-    values = [
-        structural_similarity(
+    """Structural similarity as published: 11×11 Gaussian window, population covariance.
+
+    With a mask, the mean of the similarity map over the pixels where it is 1; NaN if none. Without,
+    scikit-image's mean, which leaves out a border of half a window.
+    """
+    values = []
+    for index, (a, b) in enumerate(zip(_arrays(prediction), _arrays(truth), strict=True)):
+        mean, similarity = structural_similarity(
             a,
             b,
             channel_axis=0,
@@ -48,39 +65,52 @@ def ssim(
             gaussian_weights=True,
             sigma=1.5,
             use_sample_covariance=False,
+            full=True,
         )
-        for a, b in pairs
-    ]
+        if mask is None:
+            values.append(mean)
+        else:
+            inside = similarity.mean(0)[mask[index].cpu().numpy() > 0]
+            values.append(inside.mean() if inside.size else math.nan)
     return torch.tensor(values, dtype=torch.float32)
+
+
+def require_unit_range(images: Float[Tensor, "b 3 h w"]) -> None:
+    """Raise ValueError unless every colour is a number in [0, 1]: not [-1, 1], not 0 … 255."""
+    low, high = float(images.min()), float(images.max())
+    if not (low >= 0 and high <= 1):  # NaN is neither
+        raise ValueError(f"colours from {low:g} to {high:g}; metrics take images in [0, 1]")
 
 
 def _arrays(images: Tensor) -> np.ndarray:
     return images.detach().cpu().double().numpy()
 
 
-def squeeze_lpips(
-    weights: str | None,
-) -> Callable[[Float[Tensor, "b 3 h w"], Float[Tensor, "b 3 h w"]], Float[Tensor, " b"]]:
-    """LPIPS with the squeeze backbone, for images in [0, 1].
+def squeeze_lpips(weights: str | None) -> Distance:
+    """LPIPS with the squeeze backbone; see `lpips_distance`."""
+    return lpips_distance("squeeze", weights, "validation.lpips_weights")
+
+
+def lpips_distance(net: str, weights: str | None, option: str) -> Distance:
+    """LPIPS with the backbone `alex`, `vgg` or `squeeze`, for images in [0, 1].
 
     `weights` is a full state dict; without it the backbone must lie in torch's hub cache. Raises
-    InputError where neither is there: another network's number is never put in its place.
+    InputError where neither is there: another network's number is never put in its place. `option`
+    is what the user sets `weights` with.
     """
     import lpips  # takes a second: only where the metric is wanted
 
-    cached = Path(torch.hub.get_dir()) / "checkpoints" / _SQUEEZENET
+    cached = hub_cache() / _BACKBONES[net]
     if weights is None and not cached.is_file():
         raise InputError(
-            "LPIPS (squeeze) has no weights: give validation.lpips_weights=FILE or put "
-            f"{_SQUEEZENET} into torch's hub cache"
+            f"LPIPS ({net}) has no weights: give {option}=FILE or put {_BACKBONES[net]} into "
+            "torch's hub cache"
         )
-    network = lpips.LPIPS(net="squeeze", pnet_rand=weights is not None, verbose=False).eval()
+    with warnings.catch_warnings():  # it calls torchvision in a manner that is going out of use
+        warnings.simplefilter("ignore", UserWarning)
+        network = lpips.LPIPS(net=net, pnet_rand=weights is not None, verbose=False).eval()
     if weights is not None:
-        file = WeightFile(
-            Path(weights),
-            "validation.lpips_weights",
-            "the full state dict of lpips.LPIPS(net='squeeze')",
-        )
+        file = WeightFile(Path(weights), option, f"the full state dict of lpips.LPIPS(net='{net}')")
         file.fill(network, file.tensors(file.read()))
     network.requires_grad_(False)
 
@@ -88,18 +118,15 @@ def squeeze_lpips(
     def distance(
         prediction: Float[Tensor, "b 3 h w"], truth: Float[Tensor, "b 3 h w"]
     ) -> Float[Tensor, " b"]:
+        for images in (prediction, truth):
+            require_unit_range(images)
         values = network(prediction.cpu(), truth.cpu(), normalize=True)
         return values.flatten()
 
     return distance
 
 
-def lpips_or_reason(
-    weights: str | None,
-) -> tuple[
-    Callable[[Float[Tensor, "b 3 h w"], Float[Tensor, "b 3 h w"]], Float[Tensor, " b"]] | None,
-    dict[str, str],
-]:
+def lpips_or_reason(weights: str | None) -> tuple[Distance | None, dict[str, str]]:
     """LPIPS (squeeze), or None and why; weights that are given and cannot be used are an error."""
     try:
         return squeeze_lpips(weights), {}
@@ -107,3 +134,31 @@ def lpips_or_reason(
         if weights is not None:
             raise
         return None, {"lpips": str(error)}
+
+
+def dists_distance() -> Distance:
+    """DISTS (Ding et al., 2020) by torchmetrics, for images in [0, 1].
+
+    Raises InputError where torchvision's VGG-16 is not in torch's hub cache.
+    """
+    cached = hub_cache() / _VGG16
+    if not cached.is_file():
+        raise InputError(f"DISTS has no weights: put {_VGG16} into torch's hub cache")
+    from torchmetrics.functional.image.dists import DISTSNetwork
+
+    network = DISTSNetwork().eval()
+
+    @torch.no_grad()
+    def distance(
+        prediction: Float[Tensor, "b 3 h w"], truth: Float[Tensor, "b 3 h w"]
+    ) -> Float[Tensor, " b"]:
+        for images in (prediction, truth):
+            require_unit_range(images)
+        return network(prediction.cpu(), truth.cpu()).flatten()
+
+    return distance
+
+
+def hub_cache() -> Path:
+    """Where torchvision looks for backbones before it would download them."""
+    return Path(torch.hub.get_dir()) / "checkpoints"

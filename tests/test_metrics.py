@@ -6,11 +6,19 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from skimage.metrics import peak_signal_noise_ratio
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from extrap_train.errors import InputError
-from extrap_train.metrics import psnr, quantised, squeeze_lpips, ssim
+from extrap_train.metrics import (
+    dists_distance,
+    lpips_distance,
+    psnr,
+    quantised,
+    require_unit_range,
+    squeeze_lpips,
+    ssim,
+)
 
 
 @pytest.fixture
@@ -75,3 +83,69 @@ def test_missing_lpips_weights_are_named(tmp_path: Path, monkeypatch: pytest.Mon
     torch.save({"net.slice1.0.weight": torch.zeros(1)}, tmp_path / "other.pt")
     with pytest.raises(InputError, match=r"other\.pt: is another network"):
         squeeze_lpips(str(tmp_path / "other.pt"))
+
+
+def test_masked_ssim_is_the_maps_mean_in_the_mask(
+    images: tuple[torch.Tensor, torch.Tensor],
+) -> None:
+    """Against scikit-image's own map; the mask of everything but a border is the plain value."""
+    prediction, truth = images
+    mask = torch.zeros(3, 32, 32)
+    mask[:, 4:9, 7:20] = 1
+    expected = []
+    for p, t in zip(prediction.double().numpy(), truth.double().numpy(), strict=True):
+        _, similarity = structural_similarity(
+            p, t, channel_axis=0, data_range=1.0, gaussian_weights=True, sigma=1.5,
+            use_sample_covariance=False, full=True,
+        )  # fmt: skip
+        expected.append(similarity[:, 4:9, 7:20].mean())
+    np.testing.assert_allclose(ssim(prediction, truth, mask), expected, atol=1e-6)
+    inside = torch.zeros(3, 32, 32)
+    inside[:, 5:-5, 5:-5] = 1
+    torch.testing.assert_close(ssim(prediction, truth, inside), ssim(prediction, truth))
+    assert ssim(prediction, truth, torch.zeros_like(mask)).isnan().all()
+
+
+def test_identical_images_score_perfectly(images: tuple[torch.Tensor, torch.Tensor]) -> None:
+    _, truth = images
+    assert (psnr(truth, truth) >= 100).all()
+    torch.testing.assert_close(ssim(truth, truth), torch.ones(3))
+
+
+@pytest.mark.parametrize("scale", [lambda x: 2 * x - 1, lambda x: 255 * x, lambda x: x * torch.nan])
+def test_other_ranges_are_refused(scale, images: tuple[torch.Tensor, torch.Tensor]) -> None:
+    require_unit_range(images[1])
+    with pytest.raises(ValueError, match=r"metrics take images in \[0, 1\]"):
+        require_unit_range(scale(images[1]))
+
+
+@pytest.mark.parametrize("net", ["alex", "vgg", "squeeze"])
+def test_every_missing_backbone_is_named(
+    net: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    with pytest.raises(InputError, match=rf"LPIPS \({net}\).*option\.{net}=FILE"):
+        lpips_distance(net, None, f"option.{net}")
+    with pytest.raises(InputError, match="vgg16-397923af"):
+        dists_distance()
+
+
+def test_dists_is_torchmetrics_with_what_lies_in_the_cache(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, images: tuple[torch.Tensor, torch.Tensor]
+) -> None:
+    """Random VGG weights in the cache: the distance is that of torchmetrics' public function."""
+    from torchmetrics.functional.image.dists import deep_image_structure_and_texture_similarity
+    from torchvision.models import vgg16
+
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.setattr(torch.hub, "load_state_dict_from_url", lambda *_, **__: state)
+    monkeypatch.setattr("torchvision.models._api.load_state_dict_from_url", lambda *_, **__: state)
+    torch.manual_seed(0)
+    state = vgg16(weights=None).state_dict()
+    (tmp_path / "hub" / "checkpoints").mkdir(parents=True)
+    (tmp_path / "hub" / "checkpoints" / "vgg16-397923af.pth").touch()
+    prediction, truth = images
+    distance = dists_distance()
+    expected = deep_image_structure_and_texture_similarity(prediction, truth)
+    torch.testing.assert_close(distance(prediction, truth), expected.detach().flatten())
+    torch.testing.assert_close(distance(truth, truth), torch.zeros(3), atol=1e-5, rtol=0)

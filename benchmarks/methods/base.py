@@ -69,8 +69,9 @@ class Synthesis:
 class Method(Protocol):
     """One row of a table."""
 
-    def weight_files(self) -> Sequence[Path]:
-        """Files beside the code that decide the images: their content is part of a cell's key.
+    def weight_files(self, category: str) -> Sequence[Path]:
+        """Files beside the code that decide a category's images: their content is part of a cell's
+        key.
 
         Raises `Unavailable` where one is missing, with its name and where it comes from.
         """

@@ -17,7 +17,7 @@ from extrap_train.diffusion.baselines import inpainted_warp
 class NearestPhoto:
     """The input photograph nearest to the target, as it is."""
 
-    def weight_files(self) -> Sequence[Path]:
+    def weight_files(self, category: str) -> Sequence[Path]:
         """None."""
         return ()
 
@@ -36,7 +36,7 @@ class InpaintedWarp:
     references: int = 3
     """Most inputs that a target is warped from."""
 
-    def weight_files(self) -> Sequence[Path]:
+    def weight_files(self, category: str) -> Sequence[Path]:
         """None."""
         return ()
 

@@ -1,6 +1,6 @@
 """Scores of a model and of the baselines on the same held-out examples."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 import pandas as pd
@@ -13,10 +13,8 @@ from extrap_train.data.module import spread
 from extrap_train.diffusion.baselines import inpainted_warp, mean_filled_warp, nearest_reference
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sample_views, view_generator
-from extrap_train.metrics import psnr, quantised, ssim
+from extrap_train.metrics import Distance, psnr, quantised, ssim
 from extrap_train.views import PairBatch, combine
-
-Distance = Callable[[Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True)

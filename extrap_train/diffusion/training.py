@@ -11,7 +11,6 @@ from torch import Tensor
 
 from extrap_train.config import TrainConfig, TrainerConfig
 from extrap_train.diffusion.evaluation import (
-    Distance,
     Prediction,
     better_than_baselines,
     first_views,
@@ -21,6 +20,7 @@ from extrap_train.diffusion.evaluation import (
 )
 from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.metrics import Distance
 from extrap_train.views import PairBatch
 
 _STEPS_A_ROW = 20

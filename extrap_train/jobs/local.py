@@ -20,11 +20,12 @@ class LocalLauncher:
     """A pool of processes of one thread each, or just this process where `workers` is 1.
 
     A context manager: the pool starts with the first jobs, serves any number of runs, and ends
-    with the context. No worker outlives its parent, however that ends.
+    with the context. No worker outlives its parent, however that ends. `apart` keeps jobs out of
+    this process even where one worker would do, so that one that dies takes only itself along.
     """
 
-    def __init__(self, workers: int) -> None:
-        self.workers = workers
+    def __init__(self, workers: int, apart: bool = False) -> None:
+        self.workers, self.apart = workers, apart
         self._pool: ProcessPoolExecutor | None = None
 
     def __enter__(self) -> "LocalLauncher":
@@ -42,7 +43,7 @@ class LocalLauncher:
         self, job: Callable[[Item], Result], items: Sequence[Item]
     ) -> Iterator[tuple[int, Result | Died]]:
         """See `Launcher`."""
-        if self.workers == 1 or len(items) <= 1:
+        if not self.apart and (self.workers == 1 or len(items) <= 1):
             yield from ((index, job(item)) for index, item in enumerate(items))
             return
         suspects: list[int] = []

@@ -26,12 +26,11 @@ from extrap_train.diffusion.callbacks import (
     checkpoints,
 )
 from extrap_train.diffusion.checkpoint import initial_model, save_model
-from extrap_train.diffusion.evaluation import Distance
 from extrap_train.diffusion.memory import advice_where_memory_ends, training_memory
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.errors import InputError
-from extrap_train.metrics import lpips_or_reason
+from extrap_train.metrics import Distance, lpips_or_reason
 from extrap_train.runs import RunFolder, open_run, provenance
 from extrap_train.tasks.prepare import prepare_category
 from extrap_train.tasks.results import Results, draw_views, is_finished, write_results

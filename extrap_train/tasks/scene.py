@@ -18,12 +18,12 @@ from extrap_train.data.files import write_whole
 from extrap_train.data.module import spread
 from extrap_train.data.scene_pairs import ScenePairs
 from extrap_train.diffusion.adaptation import Adaptation, adapt
-from extrap_train.diffusion.evaluation import Distance, score_images, summarise
+from extrap_train.diffusion.evaluation import score_images, summarise
 from extrap_train.diffusion.generator import DiffusionGenerator, GeneratedViews
 from extrap_train.diffusion.lora import add_adapter, save_adapter
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError
-from extrap_train.metrics import lpips_or_reason
+from extrap_train.metrics import Distance, lpips_or_reason
 from extrap_train.pictures import contact_sheet, curve, error_map, mark_holes
 from extrap_train.tasks.results import without_nan
 from extrap_train.tasks.scene_inputs import SceneInputs, fabric_of, open_inputs, trained_model

@@ -23,7 +23,7 @@ class GaussianMethod(GaussianOptions, ABC):
     def recipe(self, scene: TrainingScene) -> Recipe:
         """What the method does in the training loop."""
 
-    def weight_files(self) -> Sequence[Path]:
+    def weight_files(self, category: str) -> Sequence[Path]:
         """None."""
         return ()
 

@@ -1,0 +1,90 @@
+"""Diffusion methods as rows of a table: a model of one family samples every target view."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis, Unavailable
+from benchmarks.methods.references import views_with_depth
+from extrap_train.config import SamplerConfig
+from extrap_train.diffusion.checkpoint import load_model, packaged_weights
+from extrap_train.diffusion.generator import DiffusionGenerator
+from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.errors import InputError
+
+
+@dataclass(frozen=True)
+class Diffusion:
+    """Samples the targets, each from its nearest inputs, with a trained model."""
+
+    family: str = "ours"
+    """What the model is told; the weights must be of this family."""
+    weights: str | None = None
+    """A model folder, or the name of one in the package, where `{category}` stands for the
+    capture's; null is `FAMILY-{category}` for ours, `FAMILY` for the category-agnostic others.
+    """
+    steps: int = 2
+    guidance: float = 1.0
+    eta: float = 0.0
+
+    def weight_files(self, category: str) -> Sequence[Path]:
+        """The files of the model's folder."""
+        return sorted(path for path in self._folder(category).rglob("*") if path.is_file())
+
+    def synthesize(self, inputs: SceneInputs) -> Synthesis:
+        """Sample every target; the time is that of a single image, its warp included."""
+        folder = self._folder(inputs.category)
+        model = _loaded(folder)
+        if model.config.family != self.family:
+            raise InputError(
+                f"{folder}: is a model of the family {model.config.family}, not {self.family}; "
+                "give weights= of the right one"
+            )
+        sampler = SamplerConfig(steps=self.steps, guidance=self.guidance, eta=self.eta)
+        names = [f"target {i}" for i in range(len(inputs.targets.world_to_cam))]
+        with Stopwatch() as watch:
+            made = DiffusionGenerator(model, sampler).generate(
+                views_with_depth(inputs), inputs.targets, names, inputs.seed
+            )
+        size = (inputs.targets.height, inputs.targets.width)
+        given = {"weights": folder.name, "depth": "used" if self.family != "zeronvs" else "scale"}
+        if made.images.shape[-2:] != size:
+            given["made at"] = f"{made.images.shape[-1]} px"
+        return Synthesis(_resampled(made.images, size), watch.seconds / len(names), given)
+
+    def _folder(self, category: str) -> Path:
+        default = f"{self.family}-{category}" if self.family == "ours" else self.family
+        name = (self.weights or default).replace("{category}", category)
+        if self.weights is not None and Path(name).is_dir():
+            return Path(name)
+        try:
+            return packaged_weights(name)
+        except InputError:
+            raise Unavailable(
+                f"no weights: {name} is neither a model folder nor in the package; train them with "
+                f"`python -m extrap_train category={category} …` and give the run's model/ folder "
+                "as options.METHOD.weights="
+            ) from None
+
+
+@lru_cache(2)
+def _loaded(folder: Path) -> ExtrapolationModel:
+    """A worker makes one cell after another, mostly with the same model."""
+    model = load_model(folder).eval().requires_grad_(False)
+    return model.to("cuda") if torch.cuda.is_available() else model
+
+
+def _resampled(
+    images: Float[Tensor, "n 3 h w"], size: tuple[int, int]
+) -> Float[Tensor, "n 3 h2 w2"]:
+    """At the table's size: a small model paints small pictures."""
+    if images.shape[-2:] == size:
+        return images.clamp(0, 1)
+    resized = functional.interpolate(images, size, mode="bicubic", antialias=True)
+    return resized.clamp(0, 1)

@@ -1,0 +1,221 @@
+"""From a table to its cells: protocol, prepared draws, and what each cell is named by."""
+
+import inspect
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+
+from benchmarks.captures import Capture, freeze, open_captures
+from benchmarks.cells import OK, CellJob, read_cell
+from benchmarks.fingerprint import code_hash, weights_hash
+from benchmarks.methods.base import Unavailable
+from benchmarks.methods.build import build_method
+from benchmarks.protocol import Draw, Protocol, digest
+from benchmarks.scenes import Scene, prepare_scene
+from benchmarks.scoring import scoring_files
+from extrap_train.config import MethodConfig, TableConfig
+from extrap_train.errors import InputError
+
+KEY_LENGTH = 20
+"""Hexadecimal digits of a cell's key."""
+
+
+@dataclass(frozen=True)
+class TableFolder:
+    """Where a table's results lie."""
+
+    path: Path
+
+    @property
+    def protocol(self) -> Path:
+        """The frozen draws."""
+        return self.path / "protocol.json"
+
+    @property
+    def cells(self) -> Path:
+        """A folder a cell."""
+        return self.path / "cells"
+
+    @property
+    def scenes(self) -> Path:
+        """A folder a prepared draw."""
+        return self.path / "scenes"
+
+    @property
+    def plan(self) -> Path:
+        """The keys of the table as it was last run: what its reports are made of."""
+        return self.path / "plan.json"
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Which draws of a protocol are run."""
+
+    categories: tuple[str, ...] = ()
+    """Empty: all of the table's."""
+    sequences: int | None = None
+    """The first so many of every category; None: all."""
+
+    def draws(self, protocol: Protocol, kinds: Iterable[str]) -> list[Draw]:
+        """The chosen draws, in the protocol's order."""
+        kinds = set(kinds)
+        order: dict[str, list[str]] = {}
+        for draw in protocol.draws:
+            names = order.setdefault(draw.category, [])
+            if draw.sequence not in names:
+                names.append(draw.sequence)
+        return [
+            draw
+            for draw in protocol.draws
+            if draw.draw in kinds
+            and (not self.categories or draw.category in self.categories)
+            and draw.sequence in order[draw.category][: self.sequences]
+        ]
+
+
+def open_protocol(table: TableConfig, folder: TableFolder) -> tuple[Protocol, list[Capture]]:
+    """The table's frozen protocol, made now if there is none yet, and its captures.
+
+    Raises InputError where the folder holds results of another protocol.
+    """
+    captures = open_captures(table.captures, table.captures.categories)
+    fresh = freeze(table.captures, table.rules, captures)
+    if not folder.protocol.is_file():
+        fresh.write(folder.protocol)
+        return fresh, captures
+    frozen = Protocol.read(folder.protocol)
+    if frozen != fresh:
+        raise InputError(
+            f"{folder.path}: holds results of another protocol ({frozen.sha256[:12]}, this one is "
+            f"{fresh.sha256[:12]}: {_difference(frozen, fresh)}); choose another output="
+        )
+    return frozen, captures
+
+
+def _difference(frozen: Protocol, fresh: Protocol) -> str:
+    before, now = asdict(frozen.rules), asdict(fresh.rules)
+    changed = [f"rules.{k} was {before[k]}, is {now[k]}" for k in now if before[k] != now[k]]
+    return "; ".join(changed) or "other captures or frames"
+
+
+def prepare_draws(
+    table: TableConfig, folder: TableFolder, draws: list[Draw], captures: list[Capture]
+) -> Iterable[Scene]:
+    """Every draw's folder, one after another, made where it is missing or of another origin."""
+    by_name = {(c.sequence.category, c.sequence.name): c for c in captures}
+    code = code_hash(["benchmarks.scenes"])
+    for draw in draws:
+        origin = digest([code, asdict(table.captures), asdict(table.rules), asdict(draw)])
+        capture = by_name[draw.category, draw.sequence]
+        yield prepare_scene(folder.scenes / draw.label, capture, draw, table.rules, origin)
+
+
+def cell_jobs(
+    table: TableConfig,
+    folder: TableFolder,
+    protocol: Protocol,
+    methods: list[MethodConfig],
+    scenes: list[Scene],
+) -> list[CellJob]:
+    """A job a method and draw, scene by scene, each named by all that decides its result."""
+    device = _device(table.device)
+    scoring = digest(
+        [
+            asdict(table.scoring) | {"lpips_weights": sorted(table.scoring.lpips_weights)},
+            weights_hash(scoring_files(table.scoring)),
+            code_hash(["benchmarks.scoring"]),
+        ]
+    )
+    categories = {scene.draw.category for scene in scenes}
+    parts = {(m.name, c): _method_hashes(m, c) for m in methods for c in categories}
+    jobs = []
+    for scene in scenes:
+        for method in methods:
+            hashes = parts[method.name, scene.draw.category] | {
+                "data": scene.data_hash,
+                "device": device,
+            }
+            hashes["rules"] = digest(asdict(protocol.rules))
+            images = digest(hashes)
+            hashes |= {"images": images, "scoring": scoring}
+            key = digest([images, scoring])[:KEY_LENGTH]
+            jobs.append(
+                CellJob(
+                    folder=folder.cells / key,
+                    scene=scene.folder,
+                    method=method,
+                    scoring=table.scoring,
+                    device=device,
+                    hashes=hashes | {"protocol": protocol.sha256},
+                )
+            )
+    return jobs
+
+
+def _method_hashes(method: MethodConfig, category: str) -> dict[str, str]:
+    built = build_method(method)
+    try:
+        weights = weights_hash(built.weight_files(category))
+    except Unavailable as error:
+        weights = f"missing: {error}"  # once they are there, the cell is another
+    return {
+        "method": digest([method.factory, method.options]),
+        "code": code_hash([inspect.getmodule(type(built)).__name__, "benchmarks.cells"]),  # type: ignore[union-attr]
+        "weights": weights,
+    }
+
+
+def _device(wanted: str) -> str:
+    if wanted not in ("auto", "cpu", "cuda"):
+        raise InputError(f"device={wanted} is unknown; known: auto, cpu, cuda")
+    if wanted == "cuda" and not torch.cuda.is_available():
+        raise InputError("device=cuda: there is no CUDA device here; give device=cpu")
+    return "cuda" if wanted != "cpu" and torch.cuda.is_available() else "cpu"
+
+
+def finished(
+    jobs: list[CellJob], folder: TableFolder, say: Callable[[str], None]
+) -> tuple[list[CellJob], list[CellJob]]:
+    """The jobs that are done and those that are to be run, the latter with images to score again
+    where only the scoring has changed. Damaged cells are announced and made anew.
+    """
+    done, open_jobs = [], []
+    for job in jobs:
+        record = _record(job.folder, say)
+        if record is not None and record["status"] == OK:
+            done.append(job)
+        else:
+            open_jobs.append(job)
+    if open_jobs:
+        images = _finished_images(folder, {job.folder for job in jobs})
+        open_jobs = [_with_images(job, images.get(job.hashes["images"])) for job in open_jobs]
+    return done, open_jobs
+
+
+def _record(folder: Path, say: Callable[[str], None]) -> dict[str, object] | None:
+    try:
+        return read_cell(folder)
+    except InputError as error:
+        say(f"{error}: made anew")
+        return None
+
+
+def _finished_images(folder: TableFolder, current: set[Path]) -> dict[str, Path]:
+    """Cells of other scorings by what decides their images."""
+    found: dict[str, Path] = {}
+    for cell in folder.cells.glob("*/cell.json"):
+        if cell.parent in current:
+            continue
+        try:
+            record = read_cell(cell.parent)
+        except InputError:
+            continue
+        if record is not None and record["status"] == OK:
+            found[record["hashes"]["images"]] = cell.parent
+    return found
+
+
+def _with_images(job: CellJob, images_from: Path | None) -> CellJob:
+    return CellJob(**{**vars(job), "images_from": images_from})

@@ -1,0 +1,44 @@
+"""A table's reports: tidy and mean CSV, Markdown, LaTeX, plots and one self-contained page."""
+
+from pathlib import Path
+
+from benchmarks.catalogue import Catalogue
+from benchmarks.plan import TableFolder
+from benchmarks.report.layout import lay_out
+from benchmarks.report.page import page
+from benchmarks.report.plots import plots
+from benchmarks.report.text import latex, markdown
+from benchmarks.results import Results
+from extrap_train.data.files import write_whole
+
+FORMATS = ("csv", "md", "latex", "html")
+
+
+def write_reports(
+    results: Results,
+    catalogue: Catalogue,
+    folder: TableFolder,
+    formats: tuple[str, ...] = FORMATS,
+) -> list[Path]:
+    """Write the reports of some formats beside the cells; returns the files, the first to read
+    last.
+    """
+    name = results.plan["table"]["name"]
+    reported = results.plan["table"]["reported"]
+    layout = lay_out(results, catalogue.reported(reported) if reported else None)
+    contents: dict[str, bytes] = {}
+    if "csv" in formats:
+        contents[f"{name}.csv"] = results.tidy.to_csv(index=False).encode()
+        contents[f"{name}_mean.csv"] = results.means().to_csv(index=False).encode()
+        contents[f"{name}_images.csv"] = results.by_image.to_csv(index=False).encode()
+    if "md" in formats:
+        contents[f"{name}.md"] = markdown(layout).encode()
+    if "latex" in formats:
+        contents[f"{name}.tex"] = latex(layout).encode()
+    if "html" in formats:
+        drawn = plots(results)
+        contents |= {f"plots/{plot}.svg": svg.encode() for plot, svg in drawn.items()}
+        contents["index.html"] = page(results, layout, drawn).encode()
+    for file, content in contents.items():
+        write_whole(folder.path / file, content)
+    return [folder.path / file for file in contents]

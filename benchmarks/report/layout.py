@@ -1,0 +1,211 @@
+"""What a printed table shows, before it is Markdown, LaTeX or HTML."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+
+from benchmarks.cells import OK
+from benchmarks.results import Results, direction
+
+NAMES = {
+    "lpips_alex": "LPIPS (alex)",
+    "lpips_vgg": "LPIPS (vgg)",
+    "lpips_squeeze": "LPIPS (squeeze)",
+    "dists": "DISTS",
+    "masked_psnr": "mPSNR",
+    "masked_ssim": "mSSIM",
+    "psnr": "PSNR",
+    "ssim": "SSIM",
+    "unseen_psnr": "unseen PSNR",
+    "unseen_ssim": "unseen SSIM",
+    "compat_psnr": "MegaScenes' PSNR",
+    "compat_ssim": "MegaScenes' SSIM",
+    "tsed": "TSED",
+    "warp_psnr": "warp PSNR",
+    "seconds": "time, s",
+    "lpips": "LPIPS",
+}
+_ARROWS = {1: "↑", -1: "↓", 0: ""}
+_DIGITS = {"psnr": 2, "memory_mib": 0}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One number of a printed table."""
+
+    text: str
+    value: float | None
+    rank: int | None = None
+    """1 is the best of its column, 2 the second."""
+    ties_best: bool = False
+    """No difference to the best beyond chance (paired bootstrap, 95 %)."""
+    title: str = ""
+    """Interval and count, or why there is no number."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method."""
+
+    label: str
+    group: str
+    entries: list[Entry]
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One printed table: rows over (metric, views)."""
+
+    title: str
+    columns: list[tuple[str, int]]
+    rows: list[Row]
+
+    def headings(self) -> list[str]:
+        """Metric with its arrow and the number of views, a column each."""
+        return [f"{name_of(m)} {_ARROWS[direction(m)]} {n} views" for m, n in self.columns]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Every panel, the published numbers apart, and the reasons of what is missing."""
+
+    title: str
+    panels: list[Panel]
+    """By draw over everything, then by category."""
+    reported: Panel | None
+    missing: list[str]
+    """Empty numbers and the cells that have none, with their reasons."""
+    notes: list[str]
+
+
+def name_of(metric: str) -> str:
+    """A metric as a heading."""
+    return NAMES.get(metric, metric.replace("_", " "))
+
+
+def lay_out(results: Results, reported: dict[str, Any] | None) -> Layout:
+    """Arrange a table's results; `reported` is a file of published numbers."""
+    table = results.plan["table"]
+    panels = []
+    categories = list(dict.fromkeys(cell["category"] for cell in results.cells))
+    for category in [None, *(categories if len(categories) > 1 else [])]:
+        means = results.means(category)
+        for draw in dict.fromkeys(cell["draw"] for cell in results.cells):
+            title = f"{category or table['title'] or table['name']}, {draw} inputs"
+            panels.append(_panel(title, results, means[means["draw"] == draw], category, draw))
+    return Layout(
+        title=table["title"] or table["name"],
+        panels=panels,
+        reported=None if reported is None else _reported(reported),
+        missing=_missing(results),
+        notes=_notes(results),
+    )
+
+
+def _panel(
+    title: str, results: Results, means: pd.DataFrame, category: str | None, draw: str
+) -> Panel:
+    cells = [
+        cell
+        for cell in results.cells
+        if cell["draw"] == draw and category in (None, cell["category"])
+    ]
+    views = sorted({cell["n_views"] for cell in cells})
+    columns = [(metric, n) for metric in results.plan["table"]["columns"] for n in views]
+    known = {(r.method, r.metric, r.n_views): r for r in means.itertuples()}
+    rows = [
+        Row(
+            entry["title"] or method,
+            entry["group"],
+            [_entry(known.get((method, *column)), column[0]) for column in columns],
+        )
+        for method, entry in results.methods.items()
+    ]
+    return Panel(title, columns, rows)
+
+
+def _entry(mean: Any, metric: str) -> Entry:
+    if mean is None:
+        return Entry("–", None, title="no number: see below")
+    rank = None if pd.isna(mean.rank) else int(mean.rank)
+    low, high = (_number(v, metric) for v in (mean.low, mean.high))
+    return Entry(
+        text=_number(mean.mean, metric),
+        value=float(mean.mean),
+        rank=rank,
+        ties_best=rank is not None and rank > 1 and not mean.behind_best,
+        title=f"95 % interval {low} to {high}, {mean.cells} cells",
+    )
+
+
+def _number(value: float, metric: str) -> str:
+    if metric == "seconds":
+        return f"{value:.3g}"  # a warp takes milliseconds, an optimisation minutes
+    digits = next((d for suffix, d in _DIGITS.items() if metric.endswith(suffix)), 3)
+    return f"{value:.{digits}f}"
+
+
+def _reported(content: dict[str, Any]) -> Panel:
+    """Published numbers, labelled as such and never ranked with ours."""
+    views = sorted({n for row in content["rows"].values() for n in row})
+    columns = [(metric, n) for metric in content["metrics"] for n in views]
+    rows = []
+    for label, by_views in content["rows"].items():
+        values = {
+            (metric, n): value
+            for n, numbers in by_views.items()
+            for metric, value in zip(content["metrics"], numbers, strict=True)
+        }
+        entries = [_stated(values.get(column), column[0]) for column in columns]
+        rows.append(Row(f"{label} (reported)", "", entries))
+    return Panel(f"Reported, not measured here: {content['source']}", columns, rows)
+
+
+def _stated(value: float | None, metric: str) -> Entry:
+    return Entry("–", None) if value is None else Entry(_number(value, metric), value)
+
+
+def _missing(results: Results) -> list[str]:
+    """One line a reason."""
+    reasons: dict[str, list[str]] = {}
+    for cell in results.cells:
+        if cell["status"] != OK:
+            where = f"{cell['method']} ({cell['status']})"
+            reasons.setdefault(cell["reason"], []).append(where)
+            continue
+        for metric, score in cell["metrics"].items():
+            if score["value"] is None:
+                reasons.setdefault(score["reason"], []).append(name_of(metric))
+    absent = len(results.plan["cells"]) - len(results.cells)
+    lines = [
+        f"{', '.join(sorted(set(where)))}: {len(where)} × {reason}"
+        for reason, where in reasons.items()
+    ]
+    return lines + ([f"{absent} cells have not been run yet"] if absent else [])
+
+
+def _notes(results: Results) -> list[str]:
+    times = {entry["title"]: entry["time"] for entry in results.methods.values()}
+    protocol = results.plan["protocol"]
+    rules = results.plan["table"]["rules"]
+    devices = sorted({cell["device"] for cell in results.cells})
+    return [
+        f"Protocol {protocol[:16]}: {rules['pool']} frames by farthest-point sampling, "
+        f"{rules['image_size']} × {rules['image_size']} px, depth of the inputs: {rules['depth']}. "
+        f"Device: {', '.join(devices)}.",
+        "Best bold, second underlined; ° marks what cannot be told from the best (the 95 % "
+        "bootstrap interval of the paired differences over captures holds zero).",
+        "Time: " + "; ".join(f"{title}: {meaning}" for title, meaning in times.items()) + ".",
+        *_given(results),
+    ]
+
+
+def _given(results: Results) -> list[str]:
+    """What each method used, for the reader who wants to know whether the race was fair."""
+    lines = {}
+    for cell in results.cells:
+        if cell["status"] == OK and cell["given"]:
+            used = ", ".join(f"{name}: {value}" for name, value in cell["given"].items())
+            lines[cell["method"]] = f"{cell['method']} — {used}"
+    return ["Given: " + "; ".join(lines.values()) + "."] if lines else []

@@ -1,0 +1,108 @@
+"""A laid-out table as Markdown and as LaTeX (booktabs)."""
+
+from collections.abc import Callable
+
+from benchmarks.report.layout import Entry, Layout, Panel
+
+_LATEX_SPECIAL = {
+    "\\": r"\textbackslash{}",
+    "&": r"\&",
+    "%": r"\%",
+    "$": r"\$",
+    "#": r"\#",
+    "_": r"\_",
+    "{": r"\{",
+    "}": r"\}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "–": "--",
+    "↑": r"$\uparrow$",
+    "↓": r"$\downarrow$",
+    "°": r"$^\circ$",
+    "×": r"$\times$",
+    "²": r"$^2$",
+}
+
+
+def markdown(layout: Layout) -> str:
+    """Every panel as a pipe table."""
+    parts = [f"# {layout.title}\n"]
+    panels = [*layout.panels[:1], *([layout.reported] if layout.reported else [])]
+    panels += layout.panels[1:]
+    parts += [f"## {panel.title}\n\n{_pipe_table(panel)}\n" for panel in panels]
+    parts.append("\n\n".join(layout.notes) + "\n")
+    if layout.missing:
+        parts.append("Missing:\n\n" + "\n".join(f"- {line}" for line in layout.missing) + "\n")
+    return "\n".join(parts)
+
+
+def _pipe_table(panel: Panel) -> str:
+    lines = [["method", *panel.headings()], ["---"] * (len(panel.columns) + 1)]
+    lines += [[row.label, *map(_markdown_entry, row.entries)] for row in panel.rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _markdown_entry(entry: Entry) -> str:
+    return _marked(entry, lambda text: f"**{text}**", lambda text: f"<u>{text}</u>")
+
+
+def _marked(entry: Entry, best: Callable[[str], str], second: Callable[[str], str]) -> str:
+    text = {1: best, 2: second}.get(entry.rank or 0, str)(entry.text)
+    return text + ("°" if entry.ties_best else "")
+
+
+def latex(layout: Layout) -> str:
+    """Every panel as a `table*` for booktabs and ulem or soul's `\\underline`."""
+    panels = [*layout.panels[:1], *([layout.reported] if layout.reported else [])]
+    tables = [_latex_table(panel) for panel in [*panels, *layout.panels[1:]]]
+    notes = "\n".join(f"% {line}" for line in [*layout.notes, *layout.missing])
+    return f"% needs \\usepackage{{booktabs}}\n{notes}\n\n" + "\n\n".join(tables) + "\n"
+
+
+def _latex_table(panel: Panel) -> str:
+    metrics = list(dict.fromkeys(metric for metric, _ in panel.columns))
+    views = list(dict.fromkeys(n for _, n in panel.columns))
+    headings = panel.headings()
+    spans = [
+        rf"\multicolumn{{{len(views)}}}{{c}}{{{_escaped(_without_views(headings[i]))}}}"
+        for i in range(0, len(headings), max(1, len(views)))
+    ]
+    counts = [f"{n}-view" for _ in metrics for n in views]
+    body, group = [], None
+    for row in panel.rows:
+        if group is not None and row.group != group:
+            body.append(r"\midrule")
+        group = row.group
+        cells = [
+            _marked(
+                Entry(_escaped(entry.text), entry.value, entry.rank),
+                lambda text: rf"\textbf{{{text}}}",
+                lambda text: rf"\underline{{{text}}}",
+            )
+            + ("$^\\circ$" if entry.ties_best else "")
+            for entry in row.entries
+        ]
+        body.append(" & ".join([_escaped(row.label), *cells]) + r" \\")
+    return "\n".join(
+        [
+            r"\begin{table*}",
+            rf"\caption{{{_escaped(panel.title)}}}",
+            rf"\begin{{tabular}}{{l{'c' * len(panel.columns)}}}",
+            r"\toprule",
+            " & ".join(["", *spans]) + r" \\",
+            " & ".join(["", *counts]) + r" \\",
+            r"\midrule",
+            *body,
+            r"\bottomrule",
+            r"\end{tabular}",
+            r"\end{table*}",
+        ]
+    )
+
+
+def _without_views(heading: str) -> str:
+    return heading.rsplit(" ", 2)[0]
+
+
+def _escaped(text: str) -> str:
+    return "".join(_LATEX_SPECIAL.get(letter, letter) for letter in text)

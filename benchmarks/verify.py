@@ -1,0 +1,64 @@
+"""Every number of a table, computed anew from the saved images and hashes."""
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+from benchmarks.cells import OK, read_cell_images, scores_of
+from benchmarks.plan import TableFolder
+from benchmarks.protocol import Protocol
+from benchmarks.results import Results, read_results
+from benchmarks.scenes import Scene
+from benchmarks.scoring import Score, score_images
+from extrap_train.config import ScoringConfig
+from extrap_train.errors import InputError
+
+RELATIVE_TOLERANCE = 1e-4
+"""Other processors and library builds round differently."""
+
+
+def verify(folder: TableFolder) -> tuple[int, list[str]]:
+    """How many cells were checked, and what does not agree, a line each."""
+    results = read_results(folder)
+    problems = list(_protocol_problems(results))
+    checked = 0
+    for cell in results.cells:
+        if cell["status"] == OK:
+            checked += 1
+            problems += [f"{cell['key']} ({cell['method']}): {p}" for p in _problems(results, cell)]
+    missing = set(results.plan["cells"]) - {cell["key"] for cell in results.cells}
+    return checked, problems + [f"{key}: the cell is missing" for key in sorted(missing)]
+
+
+def _protocol_problems(results: Results) -> Iterator[str]:
+    try:
+        protocol = Protocol.read(results.folder.protocol)
+    except InputError as error:
+        yield str(error)
+        return
+    if protocol.sha256 != results.plan["protocol"]:
+        yield f"{results.folder.protocol}: is not the protocol that the results carry"
+
+
+def _problems(results: Results, cell: dict[str, Any]) -> Iterator[str]:
+    scene = Scene.open(results.folder.scenes / cell["scene"])
+    changed = scene.changed_files()
+    if changed:
+        yield f"{scene.folder / changed[0]} is not what its hash says"
+        return
+    if scene.data_hash != cell["hashes"]["data"]:
+        yield f"{scene.folder} holds other data than the cell was made from"
+        return
+    images = read_cell_images(results.folder.cells / cell["key"], cell)
+    scoring = ScoringConfig(**results.plan["table"]["scoring"])
+    again = score_images(images, scene.truth(), scoring)
+    for name, stated in scores_of(cell).items():
+        found = again.get(name, Score(None, "the metric is not known any more"))
+        if not _same(stated.value, found.value):
+            yield f"{name} is stated as {stated.value}, computed as {found.value} {found.reason}"
+
+
+def _same(stated: float | None, found: float | None) -> bool:
+    if stated is None or found is None:
+        return stated is found
+    return math.isclose(stated, found, rel_tol=RELATIVE_TOLERANCE, abs_tol=1e-6)

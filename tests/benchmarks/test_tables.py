@@ -1,0 +1,308 @@
+"""A table ends with every cell that can be made, however its methods, files and options fail."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from benchmarks.__main__ import main
+from benchmarks.catalogue import Catalogue
+from benchmarks.compare import compare
+from benchmarks.results import TIDY, read_results
+from benchmarks.verify import verify
+from extrap_train.errors import InputError
+from tests.benchmarks.tables import greys_folder, run_greys, write_own
+
+
+@pytest.fixture(scope="module")
+def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_own(tmp_path_factory.mktemp("own"))
+
+
+@pytest.fixture(scope="module")
+def finished(own: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    output = tmp_path_factory.mktemp("results")
+    assert run_greys(own, output) == 0
+    return output
+
+
+@pytest.fixture
+def copy(finished: Path, tmp_path: Path) -> Path:
+    shutil.copytree(finished, tmp_path / "results")
+    return tmp_path / "results"
+
+
+def _table(output: Path) -> pd.DataFrame:
+    """The tidy table without what time and machine decide."""
+    table = pd.read_csv(output / "greys" / "greys.csv")
+    return table[~table["metric"].isin(["seconds", "peak_memory_mib"])].reset_index(drop=True)
+
+
+def _pictures(output: Path) -> dict[Path, bytes]:
+    return {f.relative_to(output): f.read_bytes() for f in output.glob("*/cells/*/*.png")}
+
+
+def test_a_third_partys_method_is_a_row(finished: Path) -> None:
+    table = pd.read_csv(finished / "greys" / "greys.csv")
+    assert list(table.columns) == TIDY
+    assert set(table["method"]) == {"dark", "light"}
+    assert (table["status"] == "ok").all()
+    assert len(table[table["metric"] == "psnr"]) == 4  # two methods, two captures
+    empty = table[table["metric"] == "lpips_alex"]
+    assert empty["value"].isna().all()
+    assert empty["reason"].str.contains("alexnet").all()
+    assert (table[table["metric"] == "seconds"]["value"] >= 0).all()
+    assert (table[table["metric"] == "peak_memory_mib"]["value"] > 10).all()
+
+
+def test_every_report_is_there(finished: Path) -> None:
+    folder = finished / "greys"
+    for name in ("greys.csv", "greys_mean.csv", "greys.md", "greys.tex", "index.html"):
+        assert (folder / name).stat().st_size > 100
+    assert (folder / "plots" / "masked_psnr_over_angle.svg").read_text().startswith("<svg")
+
+
+def test_a_cell_says_what_made_it(finished: Path) -> None:
+    cells = read_results(greys_folder(finished)).cells
+    for cell in cells:
+        assert {"protocol", "data", "method", "code", "weights", "scoring"} <= set(cell["hashes"])
+        assert cell["given"] == {"init": "none"}
+        assert cell["counts"] == {"greys": 1.0}
+        assert cell["versions"]["torch"]
+    assert len({cell["key"] for cell in cells}) == len(cells) == 4
+
+
+def test_a_second_run_uses_every_cell_again(
+    own: Path, copy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stamps = {f: f.stat().st_ino for f in copy.glob("greys/cells/*/*")}
+    assert run_greys(own, copy) == 0
+    assert "4 finished and used again, 0 open" in capsys.readouterr().out
+    assert {f: f.stat().st_ino for f in copy.glob("greys/cells/*/*")} == stamps
+
+
+def test_two_runs_give_the_same_images_and_numbers(
+    own: Path, finished: Path, tmp_path: Path
+) -> None:
+    run_greys(own, tmp_path)
+    pd.testing.assert_frame_equal(_table(tmp_path), _table(finished))
+    images = {f.relative_to(finished): f.read_bytes() for f in finished.glob("*/cells/*/*.png")}
+    assert images == {
+        f.relative_to(tmp_path): f.read_bytes() for f in tmp_path.glob("*/cells/*/*.png")
+    }
+
+
+def test_a_cell_changes_its_name_with_its_options_alone(own: Path, copy: Path) -> None:
+    before = {f.name for f in copy.glob("greys/cells/*")}
+    run_greys(own, copy, "options.dark.level=0.3")
+    new = {f.name for f in copy.glob("greys/cells/*")} - before
+    assert len(new) == 2  # dark's two; light's are as they were
+
+
+def test_failures_are_rows_and_the_rest_goes_on(own: Path, copy: Path) -> None:
+    assert run_greys(own, copy, "methods=[dark,broken,absent,bright,light]") == 4
+    table = pd.read_csv(copy / "greys" / "greys.csv")
+    states = table.groupby("method")["status"].first()
+    assert dict(states) == {
+        "absent": "unavailable",
+        "bright": "failed",
+        "broken": "failed",
+        "dark": "ok",
+        "light": "ok",
+    }
+    reasons = table.groupby("method")["reason"].first()
+    assert "RuntimeError: no luck" in reasons["broken"]
+    assert "metrics take images in [0, 1]" in reasons["bright"]
+    assert "grey.bin is missing" in reasons["absent"]
+    assert "no luck" in (copy / "greys" / "greys.md").read_text()
+
+
+def test_a_failed_cell_is_tried_again_and_a_finished_one_not(
+    own: Path, copy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_greys(own, copy, "methods=[dark,broken]")
+    capsys.readouterr()
+    run_greys(own, copy, "methods=[dark,broken]")
+    assert "2 finished and used again, 2 open" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("damage", [b"", b"{", b"[]", b'{"key": "other"}'])
+def test_a_corrupt_cell_is_announced_and_made_anew(
+    damage: bytes, own: Path, finished: Path, copy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    victim = next(copy.glob("greys/cells/*/cell.json"))
+    victim.write_bytes(damage)
+    assert run_greys(own, copy) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "made anew" in said
+    assert "3 finished and used again, 1 open" in said
+    pd.testing.assert_frame_equal(_table(copy), _table(finished))
+
+
+def test_a_changed_picture_is_noticed(own: Path, copy: Path) -> None:
+    folder = greys_folder(copy)
+    assert verify(folder) == (4, [])
+    picture = next(copy.glob("greys/cells/*/0.png"))
+    picture.write_bytes(picture.read_bytes()[:-1] + b"!")
+    with pytest.raises(InputError, match="not what its cell's hash says"):
+        verify(folder)
+    assert main(["verify", str(folder.path)]) == 1
+
+
+def test_verify_finds_a_forged_number_truth_and_protocol(copy: Path) -> None:
+    folder = greys_folder(copy)
+    file = next(copy.glob("greys/cells/*/cell.json"))
+    record = json.loads(file.read_text())
+    record["metrics"]["psnr"]["value"] += 0.5
+    file.write_text(json.dumps(record))
+    assert any("psnr is stated as" in problem for problem in verify(folder)[1])
+    mask = next(copy.glob("greys/scenes/*/masks/0.png"))
+    mask.write_bytes(next(copy.glob("greys/scenes/*/truth/0.png")).read_bytes())
+    assert any("masks/0.png is not what its hash says" in p for p in verify(folder)[1])
+    protocol = folder.protocol.read_text()
+    folder.protocol.write_text(protocol.replace('"pool": 9', '"pool": 8'))
+    assert any("not what its hash" in problem for problem in verify(folder)[1])
+
+
+def test_results_of_another_protocol_are_refused(own: Path, copy: Path) -> None:
+    with pytest.raises(InputError, match=r"another protocol.*rules.image_size was 24, is 16"):
+        run_greys(own, copy, "rules.image_size=16")
+    file = next(copy.glob("greys/cells/*/cell.json"))
+    record = json.loads(file.read_text())
+    record["hashes"]["protocol"] = "0" * 64
+    file.write_text(json.dumps(record))
+    with pytest.raises(InputError, match="is a result of another protocol"):
+        read_results(greys_folder(copy))
+
+
+def test_a_change_of_scoring_keeps_the_images(own: Path, copy: Path) -> None:
+    """What the method made is scored again, and the method itself is not asked."""
+    seconds = {c["images"]["0.png"]: c["seconds"] for c in read_results(greys_folder(copy)).cells}
+    assert run_greys(own, copy, "scoring.lpips=[vgg]") == 0
+    again = read_results(greys_folder(copy)).cells
+    assert len(again) == 4
+    assert "lpips_vgg" in again[0]["metrics"]
+    assert {c["images"]["0.png"]: c["seconds"] for c in again} == seconds
+
+
+def test_quick_is_a_part_of_the_same_table(own: Path, finished: Path, tmp_path: Path) -> None:
+    assert run_greys(own, tmp_path, quick=True) == 0
+    quick = read_results(greys_folder(tmp_path))
+    assert {cell["sequence"] for cell in quick.cells} == {"0000"}
+    assert {c["key"] for c in quick.cells} < {
+        c["key"] for c in read_results(greys_folder(finished)).cells
+    }
+
+
+def test_a_dry_run_makes_nothing_and_says_what_is_missing(
+    own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_greys(own, tmp_path, dry_run=True) == 0
+    said = capsys.readouterr().out
+    assert "not yet known" in said
+    assert not list(tmp_path.glob("greys/cells/*"))
+
+
+def test_compare_pairs_cells_and_tells_better_from_worse(
+    own: Path, finished: Path, copy: Path
+) -> None:
+    same = compare(greys_folder(finished), greys_folder(copy))
+    assert (same[same["metric"] == "psnr"]["verdict"] == "the same").all()
+    run_greys(own, copy, "options.dark.level=0.45")
+    changed = compare(greys_folder(finished), greys_folder(copy)).set_index(["method", "metric"])
+    row = changed.loc[("dark", "psnr")]
+    assert row["verdict"] == "better"
+    assert row["low"] > 0
+    assert row["difference"] == pytest.approx(row["after"] - row["before"])
+    assert changed.loc[("light", "psnr")]["verdict"] == "the same"
+
+
+def test_two_runs_on_one_folder_do_not_mix(own: Path, copy: Path) -> None:
+    from filelock import FileLock
+
+    with FileLock(copy / "greys" / ".lock"), pytest.raises(InputError, match="another process"):
+        run_greys(own, copy)
+
+
+def test_a_capture_with_too_few_frames_is_named(own: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"apple/0000: has 8 usable frames.*picks 9"):
+        run_greys(own, tmp_path, "captures.frames=8")
+
+
+def test_read_only_output_is_one_line(own: Path, tmp_path: Path) -> None:
+    (tmp_path / "greys").write_text("a file where the folder should be")
+    with pytest.raises(InputError, match="cannot be written"):
+        run_greys(own, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["run", "table2"], "table 'table2' is unknown; did you mean table1?"),
+        (["run", "table1", "methods=[our]"], "method 'our' is unknown; did you mean ours"),
+        (
+            ["run", "table1", "rules.veiws=[3]"],
+            "there is no option rules.veiws; did you mean rules.views",
+        ),
+        (["run", "table1", "rules.pool=many"], "could not be converted to Integer"),
+        (["run", "table1", "--config-dir", "/nowhere"], "/nowhere: no such folder"),
+        (["report", "table1", "output=/nowhere"], "holds no results"),
+        (["verify", "/nowhere"], "holds no results"),
+    ],
+)
+def test_a_wrong_word_is_one_line(
+    words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(words) == 1
+    message = capsys.readouterr().err
+    assert message.startswith("error: ")
+    assert message.count("\n") == 1
+    assert said in message
+
+
+def test_a_method_with_a_wrong_option_is_named(own: Path, copy: Path) -> None:
+    with pytest.raises(InputError, match="dark: there is no option levle; did you mean level"):
+        run_greys(own, copy, "options.dark.levle=0.3")
+
+
+def test_every_table_of_the_package_is_sound() -> None:
+    """Its methods exist, its columns are metrics, its published numbers are complete."""
+    catalogue = Catalogue.with_own()
+    for name in catalogue.names("table"):
+        table = catalogue.table(name)
+        assert table.methods
+        for method in table.methods:
+            assert catalogue.method(method).factory
+        nets = {f"lpips_{net}" for net in table.scoring.lpips}
+        assert {c for c in table.columns if c.startswith("lpips")} == nets
+        assert set(table.draws) <= set(table.rules.draws)
+        if table.reported:
+            content = catalogue.reported(table.reported)
+            for row in content["rows"].values():
+                assert all(len(v) == len(content["metrics"]) for v in row.values())
+
+
+def test_means_hold_their_interval(finished: Path) -> None:
+    means = read_results(greys_folder(finished)).means()
+    assert (
+        (means["low"] <= means["mean"] + 1e-12) & (means["mean"] <= means["high"] + 1e-12)
+    ).all()
+    psnr = means[means["metric"] == "psnr"].set_index("method")
+    assert psnr["mean"].idxmax() == psnr["rank"].idxmin()
+    assert np.isnan(means[means["metric"] == "coverage"]["rank"]).all()
+
+
+def test_the_readmes_method_runs_as_it_stands(tmp_path: Path) -> None:
+    """The file and the YAML, taken from the text."""
+    text = (Path(__file__).parents[2] / "README.md").read_text()
+    source = text.split("```python\n# mine/blur.py\n")[1].split("```")[0]
+    assert len(source.splitlines()) <= 20
+    yaml = text.split("printf '")[1].split("'")[0].replace("\\n", "\n")
+    own = write_own(tmp_path / "own")
+    (own / "blur.py").write_text(source)
+    (own / "method" / "average.yaml").write_text(yaml)
+    assert run_greys(own, tmp_path / "out", "methods=[average]", quick=True) == 0
+    assert read_results(greys_folder(tmp_path / "out")).cells[0]["status"] == "ok"
