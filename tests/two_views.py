@@ -17,10 +17,9 @@ def epipolar_distances(views: list[View]) -> np.ndarray:
 def _distances(camera, pixels, descriptors, other_camera, other_pixels, other_descriptors):
     pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(descriptors, other_descriptors, k=2)
     good = [best for best, rival in pairs if best.distance < 0.7 * rival.distance]
-    points = homogeneous(pixels[[match.queryIdx for match in good]])
-    others = homogeneous(other_pixels[[match.trainIdx for match in good]])
-    lines = points @ fundamental(camera, other_camera).T
-    return np.abs((lines * others).sum(1)) / np.linalg.norm(lines[:, :2], axis=1)
+    points = pixels[[match.queryIdx for match in good]]
+    others = other_pixels[[match.trainIdx for match in good]]
+    return line_distances(points, others, camera, other_camera)
 
 
 def features(view: View) -> tuple[np.ndarray, np.ndarray]:
@@ -42,3 +41,11 @@ def fundamental(first: Camera, second: Camera) -> np.ndarray:
 
 def homogeneous(pixels: np.ndarray) -> np.ndarray:
     return np.concatenate([pixels, np.ones((len(pixels), 1))], 1)
+
+
+def line_distances(
+    points: np.ndarray, others: np.ndarray, first: Camera, second: Camera
+) -> np.ndarray:
+    """Distances in pixels of `others`, in the second view, from the lines of `points`."""
+    lines = homogeneous(points) @ fundamental(first, second).T
+    return np.abs((lines * homogeneous(others)).sum(1)) / np.linalg.norm(lines[:, :2], axis=1)

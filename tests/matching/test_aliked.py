@@ -5,7 +5,7 @@ import pytest
 import torch
 from kornia.feature import ALIKED
 from moved_pictures import turned
-from two_views import fundamental, homogeneous
+from two_views import line_distances
 
 from extrap_train.config import AlikedMatcherConfig
 from extrap_train.data.co3d import read_category
@@ -57,9 +57,8 @@ def test_neighbouring_photographs_of_the_apple(shared, weights):
     for i, j in NEIGHBOURS:
         first, second = frames[i].load(), frames[j].load()
         matches = found.match(first.image, second.image)
-        points, others = (homogeneous(x.numpy()) for x in (matches.first, matches.second))
-        lines = points @ fundamental(first.camera, second.camera).T
-        error = np.abs((lines * others).sum(1)) / np.linalg.norm(lines[:, :2], axis=1)
+        pixels = (matches.first.numpy(), matches.second.numpy())
+        error = line_distances(*pixels, first.camera, second.camera)
         print(f"{i} to {j}: {len(matches)} matches, median {np.median(error):.2f} px")
         assert len(matches) >= 300
         assert np.median(error) <= 1.5

@@ -1,10 +1,13 @@
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from moved_pictures import Motion, texture, turned
+from two_views import line_distances
 
 from extrap_train.config import FlowMatcherConfig
+from extrap_train.data.co3d import read_category
 from extrap_train.geometry.cameras import pixel_grid
 from extrap_train.matching import DenseMatcher, Matches
 from extrap_train.matching.build import matcher
@@ -94,6 +97,20 @@ def test_the_lattice_of_matches_is_centred_and_filtered():
     assert ((matches.first - 4.5) % 8 == 0).all()
     u, v = matches.first.floor().long().unbind(-1)
     torch.testing.assert_close(matches.first_to_second, flow.first_to_second[v, u])
+
+
+@pytest.mark.parametrize(("i", "j"), [(1, 2), (2, 3), (8, 9)])
+def test_neighbouring_photographs_of_the_apple(shared, i, j):
+    frames = read_category(shared / "data" / "co3d", "apple")[0].frames
+    first, second = (frames[k].load().resized(512, 288) for k in (i, j))
+    matches = FLOW.flow(first.image, second.image).matches(stride=4, least_confidence=0.5)
+    pixels = (matches.first.numpy(), matches.second.numpy())
+    error = line_distances(*pixels, first.camera, second.camera)
+    share = 16 * len(matches) / (512 * 288)
+    print(f"{i} to {j}: {share:.0%} of the pixels, median {np.median(error):.2f} px")
+    assert share > 0.4
+    assert np.median(error) < 0.3
+    assert np.quantile(error, 0.9) < 0.8
 
 
 @settings(max_examples=15, deadline=None)
