@@ -26,8 +26,6 @@ class Fsgs(GaussianMethod):
     sh_every: int = 500
     densify_until: int = 10_000
     densify_gradient: float = 5e-4
-    prune_scale: float = float("inf")
-    prune_pixels: float = float("inf")
     reset_first: int = 2001
     reset_opacity: float = 0.05
 

@@ -14,8 +14,6 @@ from benchmarks.methods.gaussians.parameters import GaussianParameters, from_ten
 
 SPLIT_SHRINK = 1.6
 """Each half of a split Gaussian is this much smaller: 0.8 times their number, 2."""
-_REFERENCE_WIDTH = 1600
-"""Image width that `prune_pixels` is for."""
 
 
 @dataclass
@@ -24,13 +22,11 @@ class GrowthStatistics:
 
     gradient: Float[Tensor, "n"]
     visits: Float[Tensor, "n"]
-    radius_share: Float[Tensor, "n"]
-    """Largest radius seen, as a share of the image width."""
 
     @classmethod
     def empty(cls, count: int) -> "GrowthStatistics":
         """Nothing seen yet."""
-        return cls(*torch.zeros(3, count))
+        return cls(*torch.zeros(2, count))
 
     @torch.no_grad()
     def add(
@@ -45,11 +41,10 @@ class GrowthStatistics:
         ndc = gradient * gradient.new_tensor([width / 2, height / 2])
         self.gradient += torch.where(seen, ndc.norm(dim=-1), 0)
         self.visits += seen
-        self.radius_share = torch.maximum(self.radius_share, radii / width)
 
     def follow(self, kept: Bool[Tensor, "n"], added: int) -> None:
         """The rows that are left, and new ones behind them that nothing has shown yet."""
-        for name in ("gradient", "visits", "radius_share"):
+        for name in ("gradient", "visits"):
             old = getattr(self, name)[kept]
             setattr(self, name, torch.cat([old, old.new_zeros(added)]))
 
@@ -134,7 +129,6 @@ def prune(
     useless = now.opacities < options.prune_opacity
     if large_too:
         useless |= now.scales.amax(1) > options.prune_scale
-        useless |= statistics.radius_share > options.prune_pixels / _REFERENCE_WIDTH
     useless[now.opacities.argmax()] = False
     optimiser.keep(~useless)
     statistics.follow(~useless, 0)

@@ -1,5 +1,6 @@
 """What the Gaussian methods share, with the published values of 3DGS."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -53,10 +54,10 @@ class GaussianOptions:
     split_scale: float = 0.01
     """Larger ones are split, smaller ones cloned; in extents."""
     prune_opacity: float = 0.005
-    prune_scale: float = 0.1
-    """Larger ones are removed once opacity has been reset; in extents; infinite: never."""
-    prune_pixels: float = 20.0
-    """The same for the radius in the image, for a width of 1600 pixels."""
+    prune_scale: float = math.inf
+    """Larger ones are removed once opacity has been reset; in extents. Published: 0.1, for millions
+    of Gaussians; thousands cannot cover a room with such small ones.
+    """
     reset_every: int = 3000
     """0: opacity is never reset."""
     reset_first: int = 3000

@@ -61,8 +61,11 @@ def from_tensors(tensors: Mapping[str, Tensor]) -> GaussianParameters:
     return GaussianParameters(**tensors)
 
 
-def parameters_from_points(points: Points, sh_degree: int, opacity: float) -> GaussianParameters:
-    """One round Gaussian a point, as wide as the distance to its three neighbours (3DGS).
+def parameters_from_points(
+    points: Points, sh_degree: int, opacity: float, widest: Float[Tensor, "n"] | float = math.inf
+) -> GaussianParameters:
+    """One round Gaussian a point, as wide as the distance to its three neighbours (3DGS), but at
+    most `widest`.
 
     InputError without points, or where one is not finite.
     """
@@ -72,6 +75,7 @@ def parameters_from_points(points: Points, sh_degree: int, opacity: float) -> Ga
         raise InputError("an initial point is not finite; check the depth and the poses given")
     count = len(points)
     spacing = nearest_neighbours(points.positions, 3)[0].square().mean(1).sqrt()
+    spacing = torch.minimum(spacing, torch.as_tensor(widest))
     quats = torch.zeros(count, 4)
     quats[:, 0] = 1
     return GaussianParameters(

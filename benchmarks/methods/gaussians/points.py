@@ -11,7 +11,7 @@ from extrap_train.depth import DepthMap
 from extrap_train.geometry.cameras import unproject_to_world
 from extrap_train.views import Camera, View
 
-NEAREST, FARTHEST = 0.5, 3.0
+NEAREST, FARTHEST = 0.5, 10.0
 """Depths of random points, as multiples of the scene centre's depth."""
 
 
@@ -50,8 +50,8 @@ def joined(parts: Sequence[Points]) -> Points:
 def random_points(cameras: Sequence[Camera], count: int, generator: torch.Generator) -> Points:
     """Points that at least one input camera sees, in random colors.
 
-    Even over the cameras, their pixels, and depth from 0.5 to 3 times the scene centre's; the frame
-    puts that centre at the origin.
+    Even over the cameras, their pixels, and the logarithm of depth, from 0.5 to 10 times that of
+    the scene's centre, which the frame puts at the origin: surroundings have no far end.
     """
     which = torch.randint(len(cameras), (count,), generator=generator)
     place = torch.rand(count, 3, generator=generator)
@@ -59,7 +59,7 @@ def random_points(cameras: Sequence[Camera], count: int, generator: torch.Genera
     for index, camera in enumerate(cameras):
         mine = which == index
         reach = max(float(camera.world_to_cam[2, 3]), 0.1)
-        depth = reach * (NEAREST + (FARTHEST - NEAREST) * place[mine, 2])
+        depth = reach * NEAREST * (FARTHEST / NEAREST) ** place[mine, 2]
         pixels = place[mine, :2] * torch.tensor([camera.width, camera.height])
         homogeneous = torch.cat([pixels, torch.ones(len(pixels), 1)], 1)
         rays = homogeneous @ torch.linalg.inv(camera.intrinsics).T

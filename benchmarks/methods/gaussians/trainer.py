@@ -24,6 +24,10 @@ from benchmarks.methods.gaussians.schedule import Schedule, exponential
 from extrap_train.errors import InputError
 from extrap_train.views import Camera
 
+WIDEST_START = 0.05
+"""Of the distance to the nearest input camera: among a few hundred scattered points neighbours are
+so far that each Gaussian would cover a whole image, which is slow and shows nothing.
+"""
 FARTHEST = 1e5
 """Distance from the scene's centre, in extents, that no Gaussian reaches on purpose."""
 
@@ -71,7 +75,9 @@ def fit(recipe: Recipe, points: Points | None = None, show_progress: bool = Fals
     options = recipe.options
     schedule = Schedule(options.iterations, options.full_iterations)
     start = recipe.initial_points() if points is None else points
-    parameters = parameters_from_points(start, options.sh_degree, options.init_opacity)
+    eyes = torch.stack([view.camera.center for view in recipe.scene.views])
+    widest = WIDEST_START * torch.cdist(start.positions, eyes).amin(1)
+    parameters = parameters_from_points(start, options.sh_degree, options.init_opacity, widest)
     rates = learning_rates(options, schedule, progress=0.0)
     training = Training(
         GaussianOptimiser(parameters, rates),

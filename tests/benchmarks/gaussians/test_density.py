@@ -37,7 +37,7 @@ def _row(scales: list[float], opacity: float = 0.5, spacing: float = 1.0) -> Gau
 
 def _statistics(pull: list[float]) -> GrowthStatistics:
     gradient = torch.tensor(pull)
-    return GrowthStatistics(gradient, torch.ones(len(pull)), torch.full((len(pull),), 0.001))
+    return GrowthStatistics(gradient, torch.ones(len(pull)))
 
 
 def _generator() -> torch.Generator:
@@ -50,7 +50,6 @@ def test_gradients_are_in_ndc_and_a_visit():
     statistics.add(gradient, torch.tensor([5.0, 0.0]), height=20, width=10)
     statistics.add(torch.tensor([[0.0, 1.0], [0.0, 0.0]]), torch.tensor([2.0, 0.0]), 20, 10)
     torch.testing.assert_close(statistics.mean_gradient(), torch.tensor([(15 + 10) / 2, 0.0]))
-    torch.testing.assert_close(statistics.radius_share, torch.tensor([0.5, 0.0]))
 
 
 def test_small_ones_are_cloned_large_ones_split_and_the_rest_is_left():
@@ -112,7 +111,7 @@ def test_pruning_takes_the_transparent_and_later_the_large():
     parameters.opacity_logits[1] = -9.0
     for large_too, left in ((False, 2), (True, 1)):
         optimiser = GaussianOptimiser(parameters, RATES)
-        prune(optimiser, _statistics([0.0] * 3), GaussianOptions(), large_too)
+        prune(optimiser, _statistics([0.0] * 3), GaussianOptions(prune_scale=0.1), large_too)
         assert len(optimiser) == left
 
 

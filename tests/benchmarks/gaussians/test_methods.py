@@ -9,8 +9,10 @@ import torch
 from benchmarks.methods.base import Method, SceneInputs
 from benchmarks.methods.dngaussian import DnGaussian
 from benchmarks.methods.fsgs import Fsgs
+from benchmarks.methods.gaussians.fit_views import fit_views
 from benchmarks.methods.gaussians.method import GaussianMethod
 from benchmarks.methods.gaussians.options import GaussianOptions
+from benchmarks.methods.gaussians.ply import read_splats, write_splats
 from benchmarks.methods.gaussians.recipe import Recipe
 from benchmarks.methods.gaussians.scene import training_scene
 from benchmarks.methods.gaussians.trainer import Diverged, fit
@@ -169,3 +171,14 @@ def test_the_world_comes_back_in_the_units_it_was_given_in() -> None:
     distance = torch.cdist(start.means, torch.cat(surface), compute_mode=exact).amin(1)
     assert (distance < 2e-3).all()
     assert len(start) > 256
+
+
+def test_a_capture_with_depth_becomes_gaussians_that_a_ply_holds(tmp_path) -> None:
+    inputs, truth = scene_inputs(size=24)
+    options = GaussianOptions(iterations=40, full_iterations=40, init="dense", sh_degree=1)
+    fitted = fit_views(inputs.views, inputs.depth_source, options, seed=0)
+    assert psnr(fitted.render(inputs.targets), truth).mean() > 14
+    write_splats(tmp_path / "splats.ply", fitted.gaussians())
+    torch.testing.assert_close(
+        read_splats(tmp_path / "splats.ply").means, fitted.gaussians().means, atol=1e-5, rtol=1e-5
+    )
