@@ -10,11 +10,11 @@ class LoraConfig:
     rank: int = 16
     convolutions: bool = False
     """Adapt the denoiser's convolutions, too, not its attention projections alone."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 3e-3
     batch_size: int = 8
     steps: int = 5000
     """Most steps; time or the held-out pair usually ends it sooner."""
-    validate_every: int = 20
+    validate_every: int = 10
     patience: int = 8
     """Validations on the held-out pair without a gain after which it ends."""
 
