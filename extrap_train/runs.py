@@ -26,6 +26,7 @@ _NOT_PART_OF_THE_RUN = (
     "trainer.steps",
     "trainer.gradient_checkpointing",
     "trainer.compile",
+    "complete",
     *(field.name for field in fields(SceneOptions)),
 )
 """May differ on resume: where things lie, how they are measured, how long is trained, how the

@@ -17,6 +17,7 @@ from extrap_train.config.benchmark import (
 )
 from extrap_train.config.checks import required_file, validate
 from extrap_train.config.commands import DataPrepConfig, TrainConfig
+from extrap_train.config.completion import CompletionConfig, ConfidenceConfig
 from extrap_train.config.data import (
     CATEGORIES,
     CategoryConfig,
@@ -63,6 +64,8 @@ __all__ = [
     "CategoryConfig",
     "ClipConfig",
     "Co3dConfig",
+    "CompletionConfig",
+    "ConfidenceConfig",
     "DataConfig",
     "DataPrepConfig",
     "DatasetDepthConfig",

@@ -5,6 +5,7 @@ from dataclasses import asdict
 from typing import Any
 
 from extrap_train.config.commands import DataPrepConfig, TrainConfig
+from extrap_train.config.completion import CompletionConfig
 from extrap_train.config.data import Co3dConfig, PrepConfig
 from extrap_train.config.model import FAMILIES, ModelConfig, SamplerConfig
 from extrap_train.config.tree import dotted
@@ -62,6 +63,15 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "sampler.eta": (0, 1),
     "sampler.guidance_far_deg": (1, 180),
     "sampler.guidance_rescale": (0, 1),
+    "complete.step_deg": (1, 180),
+    "complete.edges": (1, 64),
+    "complete.tolerance": (1e-4, 0.5),
+    "complete.exact_size": (16, 4096),
+    "complete.held_out": (0, math.inf),
+    "complete.port": (1, 65535),
+    "complete.confidence.attempts": (1, 100),
+    "complete.confidence.least_agreement": (0, 1),
+    "complete.confidence.least_confidence": (0, 1),
     "trainer.steps": (1, math.inf),
     "trainer.batch_size": (1, math.inf),
     "trainer.warmup_steps": (0, math.inf),
@@ -91,6 +101,7 @@ def validate(config: TrainConfig | DataPrepConfig, tasks: tuple[str, ...]) -> No
         _check_one_of("task", config.task, tasks)
         _check_one_of("trainer.precision", config.trainer.precision, _PRECISIONS)
         _check_model(config.model, config.prep)
+        _check_completion(config.complete)
         _check_sampler(config.sampler)
 
 
@@ -180,6 +191,12 @@ def _check_sampler(sampler: SamplerConfig) -> None:
             f"sampler.guidance_interval={interval}: need [lowest,highest] with "
             "0 ≤ lowest ≤ highest ≤ 1"
         )
+
+
+def _check_completion(complete: CompletionConfig) -> None:
+    _check_one_of("complete.draw", complete.draw, ("one_sided", "spread"))
+    _check_one_of("complete.poses", complete.poses, ("orbit", "capture"))
+    _check_one_of("complete.generator", complete.generator, ("model", "exact"))
 
 
 def _check_one_of(name: str, value: str, known: tuple[str, ...]) -> None:

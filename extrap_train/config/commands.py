@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+from extrap_train.config.completion import CompletionConfig
 from extrap_train.config.data import CategoryConfig, DataConfig, PrepConfig
 from extrap_train.config.depth import DepthConfig
 from extrap_train.config.launcher import LauncherConfig
@@ -25,6 +26,7 @@ class TrainConfig(SceneOptions):
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
     validation: ValidationConfig = field(default_factory=ValidationConfig)
+    complete: CompletionConfig = field(default_factory=CompletionConfig)
     task: str = "category"
     seed: int = 0
     run: str | None = None

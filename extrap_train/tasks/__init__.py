@@ -5,6 +5,7 @@ from typing import Any
 
 TASKS = (
     "category",
+    "complete",
     "scene",
     "view",
 )

@@ -7,7 +7,7 @@
 from extrap_train.data.synthetic.build import build_scene
 from extrap_train.data.synthetic.orbit import handheld_orbit, sequence_name, walk_seed
 from extrap_train.data.synthetic.points import SurfacePoints, surface_points
-from extrap_train.data.synthetic.render import render
+from extrap_train.data.synthetic.render import render, trace
 from extrap_train.data.synthetic.scene import SyntheticScene
 
 __all__ = [
@@ -18,5 +18,6 @@ __all__ = [
     "render",
     "sequence_name",
     "surface_points",
+    "trace",
     "walk_seed",
 ]

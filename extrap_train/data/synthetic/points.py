@@ -21,6 +21,8 @@ class SurfacePoints:
     normals: Float[np.ndarray, "n 3"]
     colors: Float[np.ndarray, "n 3"]
     """sRGB, 0 … 1, as seen from where the point was found."""
+    is_object: Bool[np.ndarray, " n"]
+    """Whether the point lies on the object, not on what surrounds it."""
 
 
 def surface_points(scene: SyntheticScene, count: int) -> SurfacePoints:
@@ -44,8 +46,9 @@ def surface_points(scene: SyntheticScene, count: int) -> SurfacePoints:
     eyes, seen = _eyes_that_see(scene, points)
     kept = np.flatnonzero(seen)[:count]
     points, normals, eyes = points[kept], normals[kept], eyes[kept].astype(np.float32)
+    is_object = np.array([part.is_object for part in scene.parts])[scene.part_of_face[face[kept]]]
     light = radiance(scene, eyes, (points - eyes).astype(np.float32), _PIXEL_ANGLE)
-    return SurfacePoints(points, normals, linear_to_srgb(light.clip(0, 1)))
+    return SurfacePoints(points, normals, linear_to_srgb(light.clip(0, 1)), is_object)
 
 
 def _eyes_that_see(

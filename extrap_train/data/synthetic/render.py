@@ -17,20 +17,29 @@ def render(scene: SyntheticScene, camera: Camera, supersample: int = 2) -> View:
     Colours are the mean linear light of `supersample`² rays a pixel, then encoded as sRGB.
     """
     height, width = camera.height, camera.width
-    centre = scene.cast(*_rays(camera, 1))
-    found = centre.face >= 0
-    depth = np.where(found, centre.distance, 0)
-    is_object = np.array([part.is_object for part in scene.parts])[scene.part_of_face]
-    mask = is_object[centre.face] & found
+    depth, mask = trace(scene, camera)
     light = radiance(scene, *_rays(camera, supersample), float(1 / camera.intrinsics[0, 0]))
     light = light.reshape(height, supersample, width, supersample, 3).clip(0, 1).mean((1, 3))
     image = linear_to_srgb(light).transpose(2, 0, 1).astype(np.float32)
     return View(
         torch.from_numpy(np.ascontiguousarray(image)),
         camera,
-        torch.from_numpy(depth.reshape(height, width).astype(np.float32)),
-        torch.from_numpy(mask.reshape(height, width).astype(np.float32)),
+        depth,
+        mask,
     )
+
+
+def trace(
+    scene: SyntheticScene, camera: Camera
+) -> tuple[Float[torch.Tensor, "h w"], Float[torch.Tensor, "h w"]]:
+    """Depth and object mask of the rays through the pixels' centres, without any colour."""
+    centre = scene.cast(*_rays(camera, 1))
+    found = centre.face >= 0
+    is_object = np.array([part.is_object for part in scene.parts])[scene.part_of_face]
+    maps = np.where(found, centre.distance, 0), is_object[centre.face] & found
+    size = (camera.height, camera.width)
+    depth, mask = (torch.from_numpy(m.reshape(size).astype(np.float32)) for m in maps)
+    return depth, mask
 
 
 def _rays(

@@ -1,0 +1,120 @@
+"""The map's points: each surface once, with colour, normal and a confidence from all views."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import functional
+
+from extrap_train.geometry.cameras import unproject_to_world
+from extrap_train.geometry.normals import normals_from_depth
+from extrap_train.reconstruction.agreement import Sight, look_up
+from extrap_train.reconstruction.global_map import MOST_COMPARED, GlobalMap, MapView
+from extrap_train.views import combine
+
+LARGEST_STEP = 0.05
+"""Relative difference of depth between neighbouring pixels that are still one surface."""
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Points in the world."""
+
+    points: Float[Tensor, "n 3"]
+    colors: Float[Tensor, "n 3"]
+    """In [0, 1]."""
+    normals: Float[Tensor, "n 3"]
+    """Unit length, towards the camera that the point is from."""
+    confidence: Float[Tensor, " n"]
+    """0 to 1."""
+    view: Int[Tensor, " n"]
+    """Index of the map's view that the point is from."""
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __getitem__(self, chosen: Tensor) -> "PointCloud":
+        return combine([self], lambda tensors: tensors[0][chosen])
+
+
+def cloud_of(known: GlobalMap, *, votes: bool = True, subdivide: int = 1) -> PointCloud:
+    """All points that the views added, surfaces cut into `subdivide`² points a pixel.
+
+    With `votes`, points that surer views have looked through are left out, and the confidence of
+    the others is that of the surest view that shows them, times the share that agrees.
+    """
+    return combine(
+        [_points_of(known, index, votes, subdivide) for index in range(len(known))],
+        lambda tensors: torch.cat(list(tensors)),
+    )
+
+
+def _points_of(known: GlobalMap, index: int, votes: bool, subdivide: int) -> PointCloud:
+    """A view's fresh points; those at occlusion edges, on no surface, are left out."""
+    view = known.views[index]
+    normals, on_surface = normals_from_depth(view.depth, view.camera)
+    points = unproject_to_world(view.depth, view.camera)
+    confidence = view.confidence
+    kept = view.fresh & on_surface  # a few surfaces have no normal
+    if votes:
+        confidence, share = _voted(known, index, points.flatten(0, 1))
+        confidence, share = confidence.view_as(kept), share.view_as(kept)
+        kept &= share >= 0.5
+        confidence = confidence * share
+    rotation = view.camera.cam_to_world[:3, :3]
+    values = torch.cat(
+        [points, view.view.image.permute(1, 2, 0), normals @ rotation.mT, confidence[..., None]], -1
+    )
+    rows = _subdivided(values, kept, view, subdivide)
+    return PointCloud(
+        points=rows[:, :3],
+        colors=rows[:, 3:6].clamp(0, 1),
+        normals=functional.normalize(rows[:, 6:9], dim=-1),
+        confidence=rows[:, 9],
+        view=torch.full((len(rows),), index),
+    )
+
+
+def _voted(
+    known: GlobalMap, index: int, points: Float[Tensor, "n 3"]
+) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+    """Confidence of the surest view that shows a point; share of the votes that confirm it."""
+    own = known.views[index].confidence.flatten()
+    surest, confirmed, contradicted = own, own, torch.zeros_like(own)
+    for other_index in known.nearest(known.views[index].camera, MOST_COMPARED + 1):
+        if other_index == index:
+            continue
+        other = known.views[other_index]
+        said = look_up(points, other.depth, other.camera, 2 * known.tolerance)
+        confidence = other.confidence.flatten()[said.pixel]
+        agrees = torch.where(said.sight == Sight.AGREES, confidence, 0)
+        surest, confirmed = torch.maximum(surest, agrees), confirmed + agrees
+        contradicted = contradicted + torch.where(said.sight == Sight.IN_FRONT, confidence, 0)
+    return surest, confirmed / (confirmed + contradicted).clamp(min=1e-6)
+
+
+def _subdivided(
+    values: Float[Tensor, "h w c"], kept: Tensor, view: MapView, parts: int
+) -> Float[Tensor, "m c"]:
+    """The kept pixels' rows, and between four neighbours of one surface further ones.
+
+    Points between are interpolated in the plane of the picture, which on a surface that is nearly
+    flat within a pixel is the surface.
+    """
+    rows = [values[kept]]
+    corners = [values[:-1, :-1], values[:-1, 1:], values[1:, :-1], values[1:, 1:]]
+    depths = torch.stack(
+        [view.depth[:-1, :-1], view.depth[:-1, 1:], view.depth[1:, :-1], view.depth[1:, 1:]]
+    )
+    whole = kept[:-1, :-1] & kept[:-1, 1:] & kept[1:, :-1] & kept[1:, 1:]
+    whole &= depths.amax(0) < depths.amin(0).clamp(min=1e-30) * (1 + LARGEST_STEP)
+    for down in range(parts):
+        for right in range(parts):
+            if (down, right) == (0, 0):
+                continue
+            v, u = down / parts, right / parts
+            shares = ((1 - v) * (1 - u), (1 - v) * u, v * (1 - u), v * u)
+            weighted = [s * c[whole] for s, c in zip(shares, corners, strict=True)]
+            rows.append(torch.stack(weighted).sum(0))
+    return torch.cat(rows)

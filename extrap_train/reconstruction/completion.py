@@ -1,0 +1,164 @@
+"""The incremental loop: choose, generate, align, check, merge (paper II-C; METHOD §5)."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import torch
+
+from extrap_train.config import CompletionConfig
+from extrap_train.depth import DepthSource
+from extrap_train.diffusion.generator import ViewGenerator
+from extrap_train.geometry.cameras import unproject
+from extrap_train.reconstruction.global_map import GENERATED, GIVEN, GlobalMap, MapView, Origin
+from extrap_train.reconstruction.new_view import Proposal, prior_of, propose
+from extrap_train.reconstruction.planner import Query, next_query
+from extrap_train.views import Camera, View, stack_cameras
+
+REFERENCES = 3
+"""Views that a picture is warped from (paper II-A)."""
+LEAST_OVERLAP = 50
+"""Pixels that two fronts must share to be compared."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """What adding one view took and gave."""
+
+    name: str
+    agreement: float
+    attempts: int
+    edges: int
+    fresh_points: int
+    loop_error: float | None
+    """Median distance of what two fronts show of this view, in scene units; None if one front."""
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Workshop:
+    """What makes views."""
+
+    generator: ViewGenerator
+    source: DepthSource
+    """Of the generated views."""
+    options: CompletionConfig
+    seed: int
+
+
+def map_of_inputs(
+    views: Sequence[View], confidences: Sequence[torch.Tensor], tolerance: float
+) -> GlobalMap:
+    """The map of the given views; each must have a depth, and they are the roots of all others."""
+    known = GlobalMap(tolerance)
+    for index, (view, confidence) in enumerate(zip(views, confidences, strict=True)):
+        known, _ = known.added(view, confidence, Origin(GIVEN, front=index))
+    return known
+
+
+def complete(
+    known: GlobalMap,
+    queries: Sequence[Query],
+    workshop: Workshop,
+    on_step: Callable[[GlobalMap, MapView, Step], None],
+) -> GlobalMap:
+    """Add every query that the map does not have yet; `on_step` is called after each."""
+    done = {view.view.name for view in known.views}
+    left = [query for query in queries if query.name not in done]
+    while left:
+        started = time.perf_counter()
+        query = next_query(known, left)
+        planned = time.perf_counter() - started
+        left = [other for other in left if other.name != query.name]
+        known, added, step = add_view(known, query, workshop)
+        step.seconds["plan"] = planned
+        on_step(known, added, step)
+    return known
+
+
+def add_view(known: GlobalMap, query: Query, workshop: Workshop) -> tuple[GlobalMap, MapView, Step]:
+    """Make one view and merge it: again with another seed while it contradicts the map."""
+    options, clock = workshop.options, _Clock()
+    references = known.nearest(query.camera, REFERENCES)
+    neighbours = known.nearest(query.camera, options.edges)
+    tries = options.confidence.attempts if options.confidence.regenerate else 1
+    best: tuple[Proposal, int] | None = None
+    attempts = 0
+    for seed in range(workshop.seed, workshop.seed + tries):
+        picture = _picture(known, query, references, workshop.generator, seed)
+        clock.took("generate")
+        proposal = propose(known, picture, neighbours, workshop.source, options.confidence)
+        clock.took("align")
+        attempts += 1
+        if best is None or proposal.agreement > best[0].agreement:
+            best = (proposal, seed)
+        if proposal.agreement >= options.confidence.least_agreement:
+            break
+    assert best is not None
+    proposal, seed = best
+    origin = Origin(
+        GENERATED,
+        front=known.views[references[0]].origin.front,
+        references=tuple(references),
+        seed=seed,
+        agreement=proposal.agreement,
+    )
+    drift = loop_error(known, query.camera, neighbours)
+    known, added = known.added(proposal.view, proposal.confidence, origin)
+    clock.took("merge")
+    step = Step(
+        name=query.name,
+        agreement=proposal.agreement,
+        attempts=attempts,
+        edges=proposal.edges,
+        fresh_points=int(added.fresh.sum()),
+        loop_error=drift,
+        seconds=clock.seconds,
+    )
+    return known, added, step
+
+
+def loop_error(known: GlobalMap, camera: Camera, neighbours: Sequence[int]) -> float | None:
+    """How far apart two fronts see the same pixels of a camera: the drift where they meet.
+
+    None where the nearest generated views are of one front, or share too few pixels.
+    """
+    fronts: dict[int, list[int]] = {}
+    for index in neighbours:
+        if known.views[index].origin.kind == GENERATED:
+            fronts.setdefault(known.views[index].origin.front, []).append(index)
+    if len(fronts) < 2:
+        return None
+    one, other = (prior_of(known, camera, indices) for indices in list(fronts.values())[:2])
+    both = one.mask & other.mask
+    if int(both.sum()) < LEAST_OVERLAP:
+        return None
+    apart = (unproject(one.depth, camera) - unproject(other.depth, camera)).norm(dim=-1)
+    return float(apart[both].median())
+
+
+def _picture(
+    known: GlobalMap,
+    query: Query,
+    references: Sequence[int],
+    generator: ViewGenerator,
+    seed: int,
+) -> View:
+    """The query's picture as an 8-bit file would keep it, so that a resumed run sees the same."""
+    views = [known.views[index].view for index in references]
+    made = generator.generate(views, stack_cameras([query.camera]), [query.name], seed)
+    image = (made.images[0].clamp(0, 1) * 255).round() / 255
+    return View(image, query.camera, name=query.name)
+
+
+class _Clock:
+    """Seconds by part; parts that come again add up."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def took(self, part: str) -> None:
+        now = time.perf_counter()
+        self.seconds[part] = self.seconds.get(part, 0.0) + now - self._last
+        self._last = now

@@ -1,0 +1,67 @@
+"""Views and depth without error, from a synthetic scene's renderer: what remains is geometry."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+
+from extrap_train.data.module import with_warp
+from extrap_train.data.queries import query_batch
+from extrap_train.data.synthetic import SyntheticScene, render, trace
+from extrap_train.depth import DepthMap, PointMaps, point_maps_of
+from extrap_train.diffusion.generator import GeneratedViews
+from extrap_train.reconstruction.completion import REFERENCES
+from extrap_train.reconstruction.inputs import WorldUnit
+from extrap_train.views import Camera, View
+
+
+@dataclass(frozen=True)
+class ExactGenerator:
+    """A `ViewGenerator` that photographs the scene."""
+
+    scene: SyntheticScene
+    image_size: int
+    unit: WorldUnit
+    """Of the map that views and queries belong to."""
+
+    def generate(
+        self, references: Sequence[View], queries: Camera, names: Sequence[str], seed: int = 0
+    ) -> GeneratedViews:
+        """The true pictures; the seed changes nothing."""
+        batch, chosen = query_batch(references, queries, REFERENCES, self.image_size)
+        batch = with_warp(batch)
+        count = len(queries.world_to_cam)
+        images = [
+            render(self.scene, self.unit.outside(batch.camera[i])).image for i in range(count)
+        ]
+        assert batch.warp is not None
+        return GeneratedViews(torch.stack(images), batch.camera, batch.warp, chosen)
+
+
+@dataclass(frozen=True)
+class ExactDepth:
+    """A `DepthSource` that measures the scene; what a view's picture shows does not matter."""
+
+    scene: SyntheticScene
+    unit: WorldUnit
+    """Of the map that the views belong to."""
+
+    @property
+    def image_size(self) -> None:
+        """None: depth comes at the size of the photographs."""
+
+    def depth_map(self, view: View, neighbours: Sequence[View]) -> DepthMap:
+        """The true depth; the neighbours are not looked at."""
+        depth = view.depth
+        if depth is None:
+            depth = trace(self.scene, self.unit.outside(view.camera))[0] / self.unit.unit
+        return DepthMap(depth, (depth > 0).to(depth.dtype))
+
+    def depth_maps(self, views: Sequence[View]) -> list[DepthMap]:
+        """Every view's true depth."""
+        return [self.depth_map(view, ()) for view in views]
+
+    def point_maps(self, first: View, second: View) -> PointMaps:
+        """Both views' points in the first camera's frame."""
+        one, two = self.depth_map(first, ()), self.depth_map(second, ())
+        return point_maps_of(first, one, replace(second, depth=two.depth), two)

@@ -1,0 +1,194 @@
+"""From photographs to the map's first views: which, in which unit, and whether they will do."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from extrap_train.data.sequences import Frame
+from extrap_train.data.validation import is_degenerate
+from extrap_train.depth import RELIABLE_CONFIDENCE, DepthSource
+from extrap_train.errors import InputError
+from extrap_train.geometry.viewpoints import (
+    camera_centers,
+    facing,
+    farthest_point_sample,
+    pairwise_angles,
+    scene_center,
+)
+from extrap_train.reconstruction.continuation import continued_depth
+from extrap_train.reconstruction.new_view import CONTINUED_CONFIDENCE
+from extrap_train.reconstruction.planner import fit_circle
+from extrap_train.views import Camera, View, stack_poses
+
+ONE_SIDED_STEP_RAD = np.radians(25)
+"""Wanted between neighbouring inputs that stand on one side."""
+SAME_POSE_RAD = np.radians(0.5)
+LOOKS_AT_RAD = np.radians(45)
+CENTRED_SHARE = 0.25
+"""Largest offset of the principal point from the image's middle, as a share of its side."""
+FOCAL_RANGE = (0.2, 20.0)
+"""Of focal lengths, in image widths."""
+WORKING_SIDE = 512
+"""Photographs are not looked at more closely than this many pixels a side."""
+
+
+@dataclass(frozen=True)
+class WorldUnit:
+    """The map's world: the scene's centre at the origin, the cameras about 1 away from it.
+
+    No threshold then depends on the unit or the origin of the photographs' poses.
+    """
+
+    center: Float[Tensor, "3"]
+    """In the photographs' world."""
+    unit: float
+    """Length of 1 of the map, in the photographs' world."""
+
+    def inside(self, camera: Camera) -> Camera:
+        """A camera of the photographs' world in the map's."""
+        moved = camera.world_to_cam.double()
+        shift = moved[..., :3, :3] @ self.center.double() + moved[..., :3, 3]
+        return _with_translation(camera, shift / self.unit)
+
+    def outside(self, camera: Camera) -> Camera:
+        """A camera of the map's world in the photographs'."""
+        matrix = camera.world_to_cam.double()
+        shift = matrix[..., :3, 3] * self.unit - matrix[..., :3, :3] @ self.center.double()
+        return _with_translation(camera, shift)
+
+
+def _with_translation(camera: Camera, translation: Float[Tensor, "*b 3"]) -> Camera:
+    matrix = camera.world_to_cam.clone()
+    matrix[..., :3, 3] = translation.to(matrix.dtype)
+    return replace(camera, world_to_cam=matrix)
+
+
+def world_unit(cameras: Camera) -> WorldUnit:
+    """Of the inputs' cameras, which must look at something in common."""
+    center = scene_center(cameras)
+    distance = np.median(np.linalg.norm(camera_centers(cameras) - center, axis=1))
+    return WorldUnit(torch.from_numpy(center), float(distance))
+
+
+def choose_frames(
+    frames: Sequence[Frame], count: int | None, names: Sequence[str], draw: str, seed: int
+) -> list[int]:
+    """Indices of the photographs to start from; InputError for names that there are not.
+
+    `one_sided` walks along the orbit in steps near 25°, `spread` takes the farthest cameras.
+    """
+    if names:
+        known = {frame.name: index for index, frame in enumerate(frames)}
+        missing = [name for name in names if name not in known]
+        if missing:
+            raise InputError(
+                f"input_frames: the scene has no frame {missing[0]}; it has "
+                f"{', '.join(list(known)[:4])} …"
+            )
+        return [known[name] for name in names]
+    if count is None or count >= len(frames):
+        return list(range(len(frames)))
+    cameras = stack_poses([frame.camera for frame in frames])
+    start = int(np.random.default_rng(seed).integers(len(frames)))
+    if draw == "spread":
+        chosen = farthest_point_sample(camera_centers(cameras), count, start)
+        return sorted(int(index) for index in chosen)
+    azimuths = fit_circle(cameras).azimuths_rad(cameras)
+    for first in (start, *np.argsort(azimuths)):
+        walk = [int(first)]
+        while len(walk) < count:
+            ahead = (azimuths - azimuths[walk[-1]]) % (2 * np.pi)
+            ahead[walk] = np.inf
+            walk.append(int(np.abs(ahead - ONE_SIDED_STEP_RAD).argmin()))
+        span = np.diff(azimuths[walk]) % (2 * np.pi)
+        if (span < np.pi / 3).all():
+            return walk
+    return walk
+
+
+def check_cameras(cameras: Sequence[Camera], names: Sequence[str]) -> None:
+    """Refuse, in one line, what no scene can be completed from."""
+    if len(cameras) < 2:
+        raise InputError(
+            "one photograph does not show where its surfaces are; give at least two (inputs=3)"
+        )
+    for camera, name in zip(cameras, names, strict=True):
+        if bool(is_degenerate(camera)):
+            raise InputError(f"{name}: its camera is degenerate; correct the pose")
+        _check_lens(camera, name)
+    poses = stack_poses(list(cameras))
+    center = scene_center(poses)
+    seen = facing(poses, center, LOOKS_AT_RAD)
+    if not seen.all():
+        strays = ", ".join(np.array(names)[~seen][:3])
+        raise InputError(
+            f"{strays}: looks away from what the other photographs look at, so that they see "
+            "nothing in common; check the poses (their axes: +X right, +Y down, +Z forward after "
+            "reading) or leave it out"
+        )
+    angles = pairwise_angles(poses, center)
+    apart = np.linalg.norm(np.diff(camera_centers(poses), axis=0), axis=1).max()
+    np.fill_diagonal(angles, np.inf)
+    one, other = divmod(int(angles.argmin()), len(names))
+    if angles.min() < SAME_POSE_RAD or apart == 0:
+        raise InputError(
+            f"{names[one]} and {names[other]} stand in the same place as seen from the scene; "
+            "leave one out or correct the poses"
+        )
+
+
+def _check_lens(camera: Camera, name: str) -> None:
+    k = camera.intrinsics
+    offset = max(
+        abs(float(k[0, 2]) / camera.width - 0.5), abs(float(k[1, 2]) / camera.height - 0.5)
+    )
+    focal = float(k[0, 0]) / camera.width
+    if offset > CENTRED_SHARE or not FOCAL_RANGE[0] <= focal <= FOCAL_RANGE[1]:
+        raise InputError(
+            f"{name}: intrinsics (fx {float(k[0, 0]):.1f}, cx {float(k[0, 2]):.1f}, cy "
+            f"{float(k[1, 2]):.1f}) do not fit an image of {camera.width} x {camera.height} "
+            "pixels; are they those of another size?"
+        )
+
+
+def first_views(
+    photographs: Sequence[View], source: DepthSource, unit: WorldUnit, size: int
+) -> tuple[list[View], list[Float[Tensor, "s s"]]]:
+    """The photographs as squares of `size` pixels in the map's world, with depth and confidence.
+
+    Depth is measured on larger squares; where it is not reliable, surfaces are continued, with low
+    confidence. InputError where no photograph has any reliable depth.
+    """
+    side = max(size, source.image_size or WORKING_SIDE)
+    squares = [
+        photo.squared(min(side, photo.camera.height, photo.camera.width)) for photo in photographs
+    ]
+    squares = [replace(view, camera=unit.inside(view.camera)) for view in squares]
+    scaled = [
+        view if view.depth is None else replace(view, depth=view.depth / unit.unit)
+        for view in squares
+    ]
+    views, confidences = [], []
+    for view, found in zip(scaled, source.depth_maps(scaled), strict=True):
+        reliable = found.reliable()
+        small = replace(view, depth=reliable).resized(size, size)
+        assert small.depth is not None
+        confidence = functional.interpolate(
+            found.confidence.clamp(max=1)[None, None], (size, size), mode="nearest-exact"
+        )[0, 0]
+        whole = continued_depth(small.depth, small.image)
+        confidence = torch.where(small.depth > 0, confidence, CONTINUED_CONFIDENCE)
+        image = (small.image * 255).round() / 255
+        views.append(replace(small, image=image, depth=whole, mask=None))
+        confidences.append(torch.where(whole > 0, confidence, 0))
+    if not any((c >= RELIABLE_CONFIDENCE).any() for c in confidences):
+        raise InputError(
+            "no reliable depth in any photograph; stereo needs photographs 3° to 45° apart "
+            "(complete.draw=one_sided) that show the same textured surfaces"
+        )
+    return views, confidences

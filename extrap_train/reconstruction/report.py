@@ -1,0 +1,85 @@
+"""Numbers about a completed map: drift, consistency between views, coverage, 3-D scores."""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from extrap_train.data.synthetic import SyntheticScene, surface_points
+from extrap_train.geometry.viewpoints import directions_from, scene_center
+from extrap_train.metrics import psnr
+from extrap_train.reconstruction.cloud import PointCloud
+from extrap_train.reconstruction.cloud_metrics import CloudScores, score_cloud, sphere_coverage
+from extrap_train.reconstruction.completion import Step
+from extrap_train.reconstruction.global_map import GENERATED, GlobalMap
+from extrap_train.reconstruction.inputs import WorldUnit
+from extrap_train.reconstruction.new_view import prior_of, scene_size
+
+TOLERANCE = 0.02
+"""Of the 3-D scores, as a share of the object's largest side."""
+TRUTH_POINTS = 60_000
+SEEN_WITHIN_RAD = np.radians(20)
+"""A direction is covered if a view looks from less than this beside it."""
+
+
+def cloud_scores(
+    clouds: dict[str, PointCloud], scene: SyntheticScene, unit: WorldUnit
+) -> dict[str, dict[str, float]]:
+    """3-D scores of some clouds (in the map's world) of a synthetic scene, by name."""
+    truth = surface_points(scene, TRUTH_POINTS)
+    target, around = truth.points[truth.is_object], truth.points[~truth.is_object]
+    size = float((target.max(0) - target.min(0)).max())
+    scores: dict[str, dict[str, float]] = {}
+    for name, cloud in clouds.items():
+        points = cloud.points.double().numpy() * unit.unit + unit.center.double().numpy()
+        found: CloudScores = score_cloud(points, target, around, TOLERANCE * size)
+        scores[name] = asdict(found)
+    return scores
+
+
+def drift(steps: Sequence[Step], known: GlobalMap) -> dict[str, float | int | None]:
+    """Where fronts met: the largest of their errors, as a share of the scene's size."""
+    errors = [step.loop_error for step in steps if step.loop_error is not None]
+    center = torch.from_numpy(scene_center(known.cameras)).float()
+    size = scene_size(known.cameras, center)
+    return {
+        "meetings": len(errors),
+        "largest_error": max(errors) / size if errors else None,
+        "scene_size": size,
+    }
+
+
+def view_consistency(known: GlobalMap) -> float | None:
+    """Mean PSNR (dB) of generated views against their nearest generated view warped onto them,
+    over the pixels that it reaches; None with fewer than two.
+    """
+    generated = [i for i, view in enumerate(known.views) if view.origin.kind == GENERATED]
+    values = []
+    for index in generated:
+        view = known.views[index]
+        near = [i for i in known.nearest(view.camera, len(known)) if i in generated and i != index]
+        if not near:
+            return None
+        seen = prior_of(known, view.camera, near[:1])
+        mask = seen.mask.to(seen.depth.dtype)[None]
+        if mask.any():
+            values.append(float(psnr(view.view.image[None], seen.image[None], mask)))
+    return float(np.mean(values)) if values else None
+
+
+def coverage_of(known: GlobalMap) -> dict[str, float]:
+    """Share of the sphere of viewing directions that views stand within 20° of."""
+    directions = directions_from(known.cameras, scene_center(known.cameras))
+    given: Float[np.ndarray, "n"] = np.array([v.origin.kind != GENERATED for v in known.views])
+    return {
+        "inputs": sphere_coverage(directions[given], float(SEEN_WITHIN_RAD)),
+        "completed": sphere_coverage(directions, float(SEEN_WITHIN_RAD)),
+    }
+
+
+def step_records(steps: Sequence[Step]) -> list[dict[str, Any]]:
+    """The steps as JSON holds them."""
+    return [asdict(step) for step in steps]

@@ -1,0 +1,227 @@
+"""`task=complete`: from a few posed photographs of a scene to a full turn around it."""
+
+import hashlib
+import json
+import shutil
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from filelock import FileLock, Timeout
+from rich.console import Console
+from tqdm import tqdm
+
+from extrap_train.config import DatasetDepthConfig, StereoConfig, SyntheticConfig, TrainConfig
+from extrap_train.data.files import write_whole
+from extrap_train.data.scene import SYNTHETIC_SCHEME, open_scene
+from extrap_train.data.sequences import Sequence
+from extrap_train.data.synthetic import SyntheticScene, build_scene
+from extrap_train.depth.build import depth_source
+from extrap_train.errors import InputError
+from extrap_train.reconstruction.completion import Step, Workshop, complete, map_of_inputs
+from extrap_train.reconstruction.exact import ExactDepth, ExactGenerator
+from extrap_train.reconstruction.global_map import GlobalMap, MapView
+from extrap_train.reconstruction.growth import draw_plan
+from extrap_train.reconstruction.inputs import (
+    WorldUnit,
+    check_cameras,
+    choose_frames,
+    first_views,
+    world_unit,
+)
+from extrap_train.reconstruction.map_files import load_map, load_steps, save_step, save_view
+from extrap_train.reconstruction.planner import Query, expected_order, orbit_queries
+from extrap_train.reconstruction.pose_check import check_poses
+from extrap_train.tasks.completed import Completed, write_completed
+from extrap_train.tasks.weights import scene_generator
+from extrap_train.views import stack_cameras, stack_poses
+
+_NOT_PART_OF_THE_MAP = ("dry_run", "viewer", "port", "held_out")
+
+
+@dataclass(frozen=True)
+class _Job:
+    """A scene and what is to be made of it."""
+
+    config: TrainConfig
+    sequence: Sequence
+    truth: SyntheticScene | None
+    folder: Path
+    inputs: list[int]
+    unit: WorldUnit
+
+
+def run(config: TrainConfig) -> None:
+    """Complete a scene; a second run resumes after the last whole view, or says that it is done."""
+    job = _job(config)
+    console = Console()
+    job.folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(job.folder / ".lock", timeout=0):
+            _run(job, console)
+    except Timeout:
+        raise InputError(
+            f"{job.folder}: another process is completing this scene; wait for it or give run=NAME"
+        ) from None
+
+
+def _job(config: TrainConfig) -> _Job:
+    if config.scene is None:
+        raise InputError("task=complete needs a scene: give scene=FOLDER or synthetic:hydrant/0003")
+    options = config.data if isinstance(config.data, SyntheticConfig) else SyntheticConfig()
+    sequence = open_scene(config.scene, options)
+    truth = None
+    if config.scene.startswith(SYNTHETIC_SCHEME):
+        truth = build_scene(sequence.category, int(sequence.name), options.seed)
+    elif config.complete.generator == "exact":
+        raise InputError("complete.generator=exact renders: it needs scene=synthetic:…")
+    inputs = choose_frames(
+        sequence.frames, config.inputs, config.input_frames, config.complete.draw, config.seed
+    )
+    cameras = [sequence.frames[i].camera for i in inputs]
+    check_cameras(cameras, [sequence.frames[i].name for i in inputs])
+    folder = Path(config.output) / "complete" / (config.run or _slug(sequence))
+    return _Job(config, sequence, truth, folder, inputs, world_unit(stack_poses(cameras)))
+
+
+def _slug(sequence: Sequence) -> str:
+    return f"{sequence.category}_{sequence.name}"
+
+
+def _run(job: _Job, console: Console) -> None:
+    started = time.perf_counter()
+    workshop = _workshop(job, console)
+    known = _started_map(job, workshop, console)
+    seconds = {"inputs": time.perf_counter() - started}
+    queries = _queries(job, known)
+    order = expected_order(known, queries)
+    draw_plan(known, order, job.folder / "plan.png")
+    console.print(_plan_text(known, order))
+    if job.config.complete.dry_run:
+        console.print(f"plan: {job.folder / 'plan.png'}; nothing was generated")
+        return
+    started = time.perf_counter()
+    known = _completed(job, known, queries, workshop)
+    seconds["views"] = time.perf_counter() - started
+    steps = load_steps(job.folder / "map", len(known))
+    done = Completed(known, steps, job.unit, job.truth, seconds)
+    write_completed(done, job.config, job.sequence, workshop, job.folder, console)
+
+
+def _workshop(job: _Job, console: Console) -> Workshop:
+    config = job.config
+    if config.complete.generator == "exact":
+        assert job.truth is not None
+        scene = job.truth
+        return Workshop(
+            ExactGenerator(scene, config.complete.exact_size, job.unit),
+            ExactDepth(scene, job.unit),
+            config.complete,
+            config.seed,
+        )
+    generator, weights = scene_generator(config)
+    console.print(f"weights: {weights}")
+    # A generated view brings no depth along.
+    own = config.depth
+    source = StereoConfig() if isinstance(own, DatasetDepthConfig) else own
+    return Workshop(generator, depth_source(source), config.complete, config.seed)
+
+
+def _started_map(job: _Job, workshop: Workshop, console: Console) -> GlobalMap:
+    """What an earlier run left, or the inputs, measured and saved."""
+    folder = job.folder / "map"
+    if not job.config.resume:
+        shutil.rmtree(folder, ignore_errors=True)
+    _check_same(folder / "options.json", _identity(job))
+    known = load_map(folder, job.config.complete.tolerance)
+    if len(known) >= len(job.inputs):
+        console.print(f"{folder}: {len(known)} views are there already")
+        return known
+    photographs = [job.sequence.frames[i].load() for i in job.inputs]
+    check_poses(photographs)
+    views, confidences = first_views(
+        photographs, depth_source(job.config.depth), job.unit, workshop.generator.image_size
+    )
+    known = map_of_inputs(views, confidences, job.config.complete.tolerance)
+    for index, view in enumerate(known.views):
+        save_view(view, folder, index)
+    return known
+
+
+def _identity(job: _Job) -> dict[str, Any]:
+    """The options that a map depends on."""
+    config = job.config
+    complete_options = {
+        key: value
+        for key, value in asdict(config.complete).items()
+        if key not in _NOT_PART_OF_THE_MAP
+    }
+    return {
+        "scene": config.scene,
+        "inputs": [job.sequence.frames[i].name for i in job.inputs],
+        "depth": asdict(config.depth),
+        "complete": complete_options,
+        "sampler": asdict(config.sampler),
+        "weights": config.weights,
+        "adapter": config.adapter,
+        "seed": config.seed,
+    }
+
+
+def _check_same(saved: Path, identity: dict[str, Any]) -> None:
+    if saved.is_file():
+        before = json.loads(saved.read_text())
+        changed = [key for key, value in identity.items() if before.get(key) != value]
+        if changed:
+            raise InputError(
+                f"{saved.parent}: was made with another {', '.join(changed)}; choose run=NAME, or "
+                "resume=false to start over"
+            )
+    else:
+        write_whole(saved, (json.dumps(identity, indent=1) + "\n").encode())
+
+
+def _queries(job: _Job, known: GlobalMap) -> list[Query]:
+    given = stack_cameras([view.camera for view in known.views[: len(job.inputs)]])
+    if job.config.complete.poses == "orbit":
+        return orbit_queries(given, np.radians(job.config.complete.step_deg))
+    size = known.views[0].camera.width
+    return [
+        Query(frame.name, job.unit.inside(frame.camera.squared(size)))
+        for index, frame in enumerate(job.sequence.frames)
+        if index not in job.inputs
+    ]
+
+
+def _plan_text(known: GlobalMap, order: list[Query]) -> str:
+    there = {view.view.name for view in known.views}
+    names = ", ".join(query.name for query in order if query.name not in there)
+    return (
+        f"inputs: {', '.join(v.view.name for v in known.views if v.origin.kind == 'given')}\n"
+        + (f"views to make, in about this order (coverage decides): {names or 'none is left'}")
+    )
+
+
+def _completed(job: _Job, known: GlobalMap, queries: list[Query], workshop: Workshop) -> GlobalMap:
+    folder = job.folder / "map"
+    there = {view.view.name for view in known.views}
+    left = sum(query.name not in there for query in queries)
+    with tqdm(total=left, desc="views", unit="view", disable=not left) as bar:
+
+        def on_step(grown: GlobalMap, added: MapView, step: Step) -> None:
+            save_step(step, folder, len(grown) - 1)
+            save_view(added, folder, len(grown) - 1)
+            bar.update()
+
+        return complete(known, queries, workshop, on_step)
+
+
+def map_digest(known: GlobalMap) -> str:
+    """Equal for equal maps, bit for bit."""
+    digest = hashlib.sha256()
+    for view in known.views:
+        for tensor in (view.view.image, view.depth, view.confidence, view.fresh):
+            digest.update(tensor.contiguous().numpy().tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,200 @@
+"""What a completed scene leaves behind: cloud, views, models, pictures and `summary.json`."""
+
+import json
+import time
+from collections.abc import Sequence as List
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from extrap_train.config import TrainConfig
+from extrap_train.data.files import write_whole
+from extrap_train.data.sequences import Sequence
+from extrap_train.data.synthetic import SyntheticScene
+from extrap_train.errors import InputError
+from extrap_train.metrics import psnr, quantised, squeeze_lpips, ssim
+from extrap_train.pictures import colour_depth, contact_sheet, error_map, mark_holes
+from extrap_train.reconstruction.cloud import PointCloud, cloud_of
+from extrap_train.reconstruction.completion import REFERENCES, Step, Workshop
+from extrap_train.reconstruction.export import write_cloud, write_colmap, write_views
+from extrap_train.reconstruction.global_map import GENERATED, GIVEN, GlobalMap
+from extrap_train.reconstruction.growth import draw_growth, draw_turntable
+from extrap_train.reconstruction.inputs import WorldUnit
+from extrap_train.reconstruction.new_view import prior_of
+from extrap_train.reconstruction.report import (
+    cloud_scores,
+    coverage_of,
+    drift,
+    step_records,
+    view_consistency,
+)
+from extrap_train.runs import provenance
+from extrap_train.views import stack_cameras
+
+SUBDIVIDE = 3
+"""Points that a pixel of the cloud becomes along each axis."""
+
+
+@dataclass(frozen=True)
+class Completed:
+    """A map that is whole, and how it came about."""
+
+    known: GlobalMap
+    steps: List[Step]
+    unit: WorldUnit
+    truth: SyntheticScene | None
+    seconds: dict[str, float]
+    """Of this session."""
+
+
+def write_completed(
+    done: Completed,
+    config: TrainConfig,
+    sequence: Sequence,
+    workshop: Workshop,
+    folder: Path,
+    console: Console,
+) -> None:
+    """Write everything, `summary.json` last."""
+    started = time.perf_counter()
+    cloud = _sure(
+        cloud_of(done.known, votes=config.complete.confidence.votes, subdivide=SUBDIVIDE),
+        config.complete.confidence.least_confidence,
+    )
+    outside = _outside(cloud, done.unit)
+    write_cloud(outside, folder / "cloud.ply")
+    write_views(done.known, done.unit, folder)
+    write_colmap(done.known, done.unit, outside, folder)
+    draw_growth(done.known, cloud, folder / "growth.png")
+    draw_turntable(done.known, cloud, folder / "turntable.mp4")
+    _draw_views(done.known, folder / "views.png")
+    done.seconds["export"] = time.perf_counter() - started
+    started = time.perf_counter()
+    held_out, missing = _compare_held_out(done, config, sequence, workshop, folder)
+    metrics = _metrics(done, cloud)
+    done.seconds["measure"] = time.perf_counter() - started
+    summary = {
+        "views": {kind: _count(done.known, kind) for kind in (GIVEN, GENERATED)},
+        "points": len(cloud),
+        "metrics": metrics,
+        "held_out": held_out,
+        "missing": missing,
+        "loop": drift(done.steps, done.known),
+        "consistency_db": view_consistency(done.known),
+        "sphere_coverage": coverage_of(done.known),
+        "seconds": done.seconds,
+        "steps": step_records(done.steps),
+        "provenance": provenance(config, {"scene": config.scene or ""}),
+    }
+    write_whole(folder / "summary.json", (json.dumps(summary, indent=1) + "\n").encode())
+    _print(summary, console)
+    console.print(f"pictures: {folder / 'growth.png'}\nresult: {folder}")
+
+
+def _count(known: GlobalMap, kind: str) -> int:
+    return sum(view.origin.kind == kind for view in known.views)
+
+
+def _sure(cloud: PointCloud, least: float) -> PointCloud:
+    return cloud[cloud.confidence >= least]
+
+
+def _outside(cloud: PointCloud, unit: WorldUnit) -> PointCloud:
+    """In the photographs' world."""
+    points = cloud.points.double() * unit.unit + unit.center.double()
+    return replace(cloud, points=points.float())
+
+
+def _metrics(done: Completed, cloud: PointCloud) -> dict[str, dict[str, float]] | None:
+    """3-D scores where the truth is known: of the inputs alone, and of everything."""
+    if done.truth is None:
+        return None
+    given = _count(done.known, GIVEN)
+    only = replace(done.known, views=done.known.views[:given])
+    inputs = cloud_of(only, votes=False, subdivide=SUBDIVIDE)
+    return cloud_scores({"inputs": inputs, "completed": cloud}, done.truth, done.unit)
+
+
+def _draw_views(known: GlobalMap, path: Path) -> None:
+    contact_sheet(
+        {
+            "view": torch.stack([view.view.image for view in known.views]),
+            "depth": colour_depth(torch.stack([view.depth for view in known.views])),
+            "confidence": torch.stack([v.confidence.expand(3, -1, -1) for v in known.views]),
+            "new points": torch.stack([v.fresh.float().expand(3, -1, -1) for v in known.views]),
+        },
+        path,
+    )
+
+
+def _compare_held_out(
+    done: Completed, config: TrainConfig, sequence: Sequence, workshop: Workshop, folder: Path
+) -> tuple[dict[str, float | None] | None, dict[str, str]]:
+    """Views generated at the poses of photographs that were no inputs, against these."""
+    given = done.known.views[: _count(done.known, GIVEN)]
+    names = {view.view.name for view in given}
+    frames = [frame for frame in sequence.frames if frame.name not in names]
+    frames = frames[: config.complete.held_out]
+    if not frames or config.complete.generator == "exact":
+        return None, {}
+    size = workshop.generator.image_size
+    truth = [frame.load().squared(size) for frame in frames]
+    cameras = [done.unit.inside(view.camera) for view in truth]
+    made, warps, masks = [], [], []
+    only = GlobalMap(done.known.tolerance, given)
+    for view, camera in zip(truth, cameras, strict=True):
+        near = [done.known.views[i].view for i in done.known.nearest(camera, REFERENCES)]
+        query = stack_cameras([camera])
+        generated = workshop.generator.generate(near, query, [view.name], config.seed)
+        made.append(generated.images[0])
+        seen = prior_of(only, camera, only.nearest(camera, REFERENCES))
+        warps.append(mark_holes(seen.image[None], seen.mask.float()[None])[0])
+        masks.append(seen.mask.float())
+    images, photos = quantised(torch.stack(made)), quantised(torch.stack([v.image for v in truth]))
+    contact_sheet(
+        {
+            "warp of the inputs": torch.stack(warps),
+            "generated": images,
+            "photograph": photos,
+            "error": error_map(images, photos),
+        },
+        folder / "held_out.png",
+    )
+    mask = torch.stack(masks)
+    scores: dict[str, float | None] = {
+        "views": float(len(frames)),
+        "psnr": float(psnr(images, photos).mean()),
+        "psnr_masked": float(psnr(images, photos, mask).nanmean()),
+        "ssim": float(ssim(images, photos).mean()),
+        "lpips": None,
+    }
+    try:
+        scores["lpips"] = float(
+            squeeze_lpips(config.validation.lpips_weights)(images, photos).mean()
+        )
+    except InputError as error:
+        if config.validation.lpips_weights is not None:
+            raise
+        return scores, {"lpips": str(error)}
+    return scores, {}
+
+
+def _print(summary: dict[str, Any], console: Console) -> None:
+    if summary["metrics"]:
+        names = ("accuracy", "completeness", "f_score")
+        table = Table("", *names, title="cloud against the truth, at 2 % of the object's size")
+        for which, row in summary["metrics"].items():
+            table.add_row(which, *(f"{row[name]:.3f}" for name in names))
+        console.print(table)
+    if summary["held_out"]:
+        scores = {k: v for k, v in summary["held_out"].items() if v is not None}
+        console.print("held out: " + ", ".join(f"{k} {v:.3f}" for k, v in scores.items()))
+    error = summary["loop"]["largest_error"]
+    met = "fronts did not meet" if error is None else f"{100 * error:.2f} % of the scene's size"
+    console.print(f"loop closure: {met}")
+    for name, reason in summary["missing"].items():
+        console.print(f"missing {name}: {reason}")

@@ -1,0 +1,191 @@
+"""The loop on analytic scenes with exact pictures and depth: what is left is geometry."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import scenes
+import torch
+
+from extrap_train.config import CompletionConfig, ConfidenceConfig
+from extrap_train.data.module import with_warp
+from extrap_train.data.queries import query_batch
+from extrap_train.depth import RELIABLE_CONFIDENCE, DepthMap, PointMaps, point_maps_of
+from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.diffusion.generator import GeneratedViews
+from extrap_train.reconstruction.cloud import cloud_of
+from extrap_train.reconstruction.completion import Workshop, complete, map_of_inputs
+from extrap_train.reconstruction.global_map import GENERATED, GlobalMap
+from extrap_train.reconstruction.map_files import load_map, save_view
+from extrap_train.reconstruction.planner import orbit_queries
+from extrap_train.views import Camera, View
+
+SIZE = 48
+SCENE = scenes.Scene((scenes.sphere(0.6), scenes.plane(0.6, (0.0, 1.0, 0.0))))
+
+
+def photograph(camera: Camera, name: str = "") -> View:
+    return View(SCENE.image(camera), camera, SCENE.depth(camera), name=name)
+
+
+@dataclass(frozen=True)
+class TracedGenerator:
+    """Exact pictures; those of `wrong` names, asked for with the first seed, are moved aside."""
+
+    wrong: tuple[str, ...] = ()
+    stubborn: bool = False
+
+    @property
+    def image_size(self) -> int:
+        return SIZE
+
+    def generate(self, references, queries, names, seed=0):
+        batch, chosen = query_batch(references, queries, 3, SIZE)
+        images = [SCENE.image(batch.camera[i]) for i in range(len(names))]
+        for i, name in enumerate(names):
+            if name in self.wrong and (seed == 0 or self.stubborn):
+                images[i] = images[i].roll(7, -1)
+        batch = with_warp(batch)
+        return GeneratedViews(torch.stack(images), batch.camera, batch.warp, chosen)
+
+
+@dataclass(frozen=True)
+class TracedDepth:
+    """Depth that belongs to what the picture shows: moved along where the picture is."""
+
+    @property
+    def image_size(self) -> None:
+        return None
+
+    def depth_map(self, view, neighbours):
+        depth = SCENE.depth(view.camera) if view.depth is None else view.depth
+        if (view.image - SCENE.image(view.camera).roll(7, -1)).abs().mean() < 0.01:
+            depth = depth.roll(7, -1)
+        return DepthMap(depth, (depth > 0).float())
+
+    def depth_maps(self, views):
+        return [self.depth_map(view, ()) for view in views]
+
+    def point_maps(self, first, second) -> PointMaps:
+        one, two = self.depth_map(first, ()), self.depth_map(second, ())
+        return point_maps_of(first, one, replace(second, depth=two.depth), two)
+
+
+def inputs(*azimuths_deg: float) -> GlobalMap:
+    views = [photograph(scenes.orbit_camera(a, size=SIZE), f"photo{a}") for a in azimuths_deg]
+    return map_of_inputs(views, [(view.depth > 0).float() for view in views], 0.01)
+
+
+def completed(known: GlobalMap, generator=None, **confidence):
+    options = CompletionConfig(confidence=ConfidenceConfig(**confidence))
+    steps = []
+    workshop = Workshop(generator or TracedGenerator(), TracedDepth(), options, 0)
+    # Queries are planned from the inputs alone, wherever a run was cut.
+    queries = orbit_queries(known.cameras[:3], np.radians(30))
+    grown = complete(known, queries, workshop, lambda m, v, step: steps.append(step))
+    return grown, steps
+
+
+def off_surface(known: GlobalMap, votes: bool = True) -> float:
+    """Share of the measured points that lie more than 2 % of the sphere's size off any surface."""
+    cloud = cloud_of(known, votes=votes)
+    points = cloud.points[cloud.confidence >= RELIABLE_CONFIDENCE]
+    distance = torch.minimum((points.norm(dim=-1) - 0.6).abs(), (points[:, 1] - 0.6).abs())
+    return float((distance > 0.024).float().mean())
+
+
+def sphere_completeness(known: GlobalMap) -> float:
+    """Share of a band around the sphere that has a point within 5 % of its radius."""
+    azimuth = torch.linspace(0, 2 * torch.pi, 181)[:-1]
+    band = torch.cat(
+        [
+            0.6
+            * torch.stack([azimuth.cos() * c, torch.full_like(azimuth, s), azimuth.sin() * c], 1)
+            for s, c in ((-0.3, 0.954), (0.0, 1.0))
+        ]
+    )
+    near = torch.cdist(band, cloud_of(known, subdivide=2).points).amin(1)
+    return float((near < 0.03).float().mean())
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return completed(inputs(-30.0, 0.0, 30.0))
+
+
+def test_a_turn_fills_what_the_inputs_leave_open(whole):
+    known, steps = whole
+    assert sphere_completeness(inputs(-30.0, 0.0, 30.0)) < 0.7
+    assert sphere_completeness(known) > 0.85
+    assert off_surface(known) < 0.03
+    assert len(steps) == 9
+    assert all(step.edges >= 3 and step.attempts == 1 for step in steps)
+
+
+def test_two_fronts_meet_and_hardly_disagree(whole):
+    known, steps = whole
+    fronts = {view.origin.front for view in known.views if view.origin.kind == GENERATED}
+    assert fronts == {0, 2}
+    errors = [step.loop_error for step in steps if step.loop_error is not None]
+    assert errors
+    assert max(errors) < 0.02 * 1.2
+
+
+def test_no_point_is_there_twice(whole):
+    """A view from where the map is complete adds next to nothing."""
+    known, _ = whole
+    again, added = known.added(
+        photograph(scenes.orbit_camera(15.0, size=SIZE)),
+        torch.ones(SIZE, SIZE),
+        known.views[0].origin,
+    )
+    assert added.fresh.float().mean() < 0.05
+    assert len(again) == len(known) + 1
+
+
+def test_nothing_known_is_changed_by_what_comes_later(whole):
+    known, _ = whole
+    before = inputs(-30.0, 0.0, 30.0)
+    for old, new in zip(before.views, known.views, strict=False):
+        assert torch.equal(old.depth, new.depth)
+        assert torch.equal(old.confidence, new.confidence)
+
+
+def test_resumed_from_disk_it_is_the_same_bit_for_bit(whole, tmp_path):
+    known, _ = whole
+    for index, view in enumerate(known.views[:7]):
+        save_view(view, tmp_path, index)
+    loaded = load_map(tmp_path, known.tolerance)
+    resumed, steps = completed(loaded)
+    assert len(steps) == len(known) - 7
+    for one, other in zip(known.views, resumed.views, strict=True):
+        assert one.view.name == other.view.name
+        assert torch.equal(one.depth, other.depth)
+        assert torch.equal(one.fresh, other.fresh)
+
+
+def test_a_wrong_picture_is_noticed_and_made_again(whole):
+    _, steps = completed(inputs(-30.0, 0.0, 30.0), TracedGenerator(("orbit090",)))
+    tried = {step.name: step.attempts for step in steps}
+    assert tried.pop("orbit090") == 2
+    assert set(tried.values()) == {1}
+
+
+def test_confidence_handling_keeps_a_stubbornly_wrong_view_out_of_the_cloud():
+    wrong = TracedGenerator(("orbit090", "orbit270"), stubborn=True)
+    known = inputs(-30.0, 0.0, 30.0)
+    handled, _ = completed(known, wrong)
+    off = dict.fromkeys(("repair", "free_space", "votes", "regenerate", "reject"), False)
+    trusting, _ = completed(known, wrong, **off)
+    assert off_surface(handled) < off_surface(trusting, votes=False) / 2
+
+
+def test_dataset_depth_needs_a_depth():
+    """A picture without depth cannot be paired by a source that reads it from the data."""
+    known = inputs(-30.0, 0.0, 30.0)
+    options = CompletionConfig()
+    queries = orbit_queries(known.cameras, np.radians(30))[:1]
+    workshop = Workshop(TracedGenerator(), DatasetDepth(), options, 0)
+    grown = complete(known, queries, workshop, lambda m, v, step: None)
+    assert (grown.views[-1].confidence <= 1).all()
+    assert grown.views[-1].origin.kind == GENERATED

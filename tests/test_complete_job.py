@@ -1,0 +1,134 @@
+"""`task=complete` on a tiny synthetic scene: what it leaves, that no kill changes it, bad input."""
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plyfile import PlyData
+
+from extrap_train.data.scene import open_scene
+
+_TINY = [
+    "task=complete",
+    "category=cup",
+    "scene=synthetic:cup/0000",
+    "data.image_size=48",
+    "inputs=3",
+    "complete.generator=exact",
+    "complete.exact_size=40",
+    "complete.step_deg=60",
+    "threads=1",
+]
+
+
+def _start(output: Path, *more: str) -> "subprocess.Popen[bytes]":
+    command = [sys.executable, "-m", "extrap_train", *_TINY, f"output={output}", *more]
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+    output.mkdir(parents=True, exist_ok=True)
+    with (output / "log.txt").open("wb") as log:
+        return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
+
+
+def _finish(output: Path, *more: str, status: int = 0) -> str:
+    process = _start(output, *more)
+    process.wait(timeout=600)
+    said = (output / "log.txt").read_text()
+    assert process.returncode == status, said
+    return said
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    output = tmp_path_factory.mktemp("undisturbed")
+    _finish(output)
+    return output
+
+
+def _folder(output: Path) -> Path:
+    return output / "complete" / "cup_0000"
+
+
+def _content(output: Path) -> dict[str, str]:
+    folder = _folder(output)
+    files = [folder / "cloud.ply", folder / "transforms.json", *sorted(folder.glob("views/*"))]
+    files += sorted((folder / "colmap/sparse/0").glob("*"))
+    return {
+        str(file.relative_to(folder)): hashlib.sha256(file.read_bytes()).hexdigest()
+        for file in files
+    }
+
+
+def test_the_contract_of_files_is_kept(undisturbed: Path) -> None:
+    folder = _folder(undisturbed)
+    names = {path.name for path in folder.iterdir()}
+    expected = {"cloud.ply", "transforms.json", "colmap", "views", "growth.png", "turntable.mp4"}
+    assert expected | {"plan.png", "summary.json"} <= names
+    summary = json.loads((folder / "summary.json").read_text())
+    steps = summary["steps"]
+    assert len(steps) == summary["views"]["generated"] > 2
+    assert all({"plan", "generate", "align", "merge"} <= step["seconds"].keys() for step in steps)
+    before, after = summary["metrics"]["inputs"], summary["metrics"]["completed"]
+    assert after["completeness"] > before["completeness"] + 0.1
+    assert after["accuracy"] > 0.9
+    vertices = PlyData.read(folder / "cloud.ply")["vertex"]
+    assert {"x", "nx", "red", "confidence"} <= {p.name for p in vertices.properties}
+    assert len(vertices) == summary["points"]
+    lengths = np.linalg.norm([vertices["nx"], vertices["ny"], vertices["nz"]], axis=0)
+    assert np.abs(lengths - 1).max() < 1e-3
+
+
+@pytest.mark.parametrize("where", ["", "colmap"])
+def test_what_is_written_is_read_back_by_the_readers_of_other_captures(
+    undisturbed: Path, where: str
+) -> None:
+    """The inputs come back at the poses of the capture that they were taken from."""
+    written = open_scene(str(_folder(undisturbed) / where))
+    capture = {frame.name: frame for frame in open_scene("synthetic:cup/0000").frames}
+    given = [f for f in written.frames if any(name in f.name for name in capture)]
+    assert len(given) == 3
+    for frame in given:
+        original = capture[frame.name.split("_", 1)[1].removesuffix(".png")]
+        assert np.allclose(
+            frame.camera.world_to_cam.numpy(), original.camera.world_to_cam.numpy(), atol=1e-4
+        )
+    view = given[0].load()
+    assert view.image.shape == (3, 40, 40)
+    if not where:
+        assert view.depth is not None
+        assert 0.5 < float(view.depth.median()) < 6
+
+
+def test_killed_between_and_inside_views_the_result_is_the_same(
+    undisturbed: Path, tmp_path: Path
+) -> None:
+    views = _folder(tmp_path) / "map"
+    for reached in (1, 4, 5):
+        process = _start(tmp_path)
+        while process.poll() is None and len(list(views.glob("[0-9]*.npz"))) < reached:
+            time.sleep(0.005)
+        time.sleep(0.1 * (reached % 2))  # now and then in the middle of a view
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    _finish(tmp_path)
+    assert _content(tmp_path) == _content(undisturbed)
+
+
+def test_a_second_run_with_other_options_is_refused(undisturbed: Path) -> None:
+    said = _finish(undisturbed, "complete.tolerance=0.02", status=1)
+    assert "was made with another complete; choose run=NAME" in said
+    assert "Traceback" not in said
+
+
+def test_a_dry_run_plans_and_generates_nothing(tmp_path: Path) -> None:
+    said = _finish(tmp_path, "complete.dry_run=true")
+    assert "views to make" in said
+    assert "nothing was generated" in said
+    assert (_folder(tmp_path) / "plan.png").stat().st_size > 1000
+    assert not (_folder(tmp_path) / "summary.json").exists()
