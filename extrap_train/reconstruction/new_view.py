@@ -24,7 +24,7 @@ from extrap_train.views import Camera, View, stack_cameras
 
 CONTINUED_CONFIDENCE = 0.15
 """Of depth that nothing measures."""
-CONTRADICTED = 0.5
+CONTRADICTED = 0.9
 """Factor on the confidence of a pixel whose two depths differ."""
 
 

@@ -1,6 +1,5 @@
 """`task=complete`: from a few posed photographs of a scene to a full turn around it."""
 
-import hashlib
 import json
 import shutil
 import time
@@ -9,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from filelock import FileLock, Timeout
 from rich.console import Console
 from tqdm import tqdm
@@ -19,6 +19,7 @@ from extrap_train.data.scene import SYNTHETIC_SCHEME, open_scene
 from extrap_train.data.sequences import Sequence
 from extrap_train.data.synthetic import SyntheticScene, build_scene
 from extrap_train.depth.build import depth_source
+from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.errors import InputError
 from extrap_train.reconstruction.completion import Step, Workshop, complete, map_of_inputs
 from extrap_train.reconstruction.exact import ExactDepth, ExactGenerator
@@ -35,7 +36,7 @@ from extrap_train.reconstruction.map_files import load_map, load_steps, save_ste
 from extrap_train.reconstruction.planner import Query, expected_order, orbit_queries
 from extrap_train.reconstruction.pose_check import check_poses
 from extrap_train.tasks.completed import Completed, write_completed
-from extrap_train.tasks.weights import scene_generator
+from extrap_train.tasks.scene_inputs import trained_model
 from extrap_train.views import stack_cameras, stack_poses
 
 _NOT_PART_OF_THE_MAP = ("dry_run", "viewer", "port", "held_out")
@@ -92,7 +93,7 @@ def _slug(sequence: Sequence) -> str:
 
 def _run(job: _Job, console: Console) -> None:
     started = time.perf_counter()
-    workshop = _workshop(job, console)
+    workshop = _workshop(job)
     known = _started_map(job, workshop, console)
     seconds = {"inputs": time.perf_counter() - started}
     queries = _queries(job, known)
@@ -103,14 +104,15 @@ def _run(job: _Job, console: Console) -> None:
         console.print(f"plan: {job.folder / 'plan.png'}; nothing was generated")
         return
     started = time.perf_counter()
-    known = _completed(job, known, queries, workshop)
+    with _viewer(job, known, console) as viewer:
+        known = _completed(job, known, queries, workshop, viewer)
     seconds["views"] = time.perf_counter() - started
     steps = load_steps(job.folder / "map", len(known))
     done = Completed(known, steps, job.unit, job.truth, seconds)
     write_completed(done, job.config, job.sequence, workshop, job.folder, console)
 
 
-def _workshop(job: _Job, console: Console) -> Workshop:
+def _workshop(job: _Job) -> Workshop:
     config = job.config
     if config.complete.generator == "exact":
         assert job.truth is not None
@@ -121,8 +123,9 @@ def _workshop(job: _Job, console: Console) -> Workshop:
             config.complete,
             config.seed,
         )
-    generator, weights = scene_generator(config)
-    console.print(f"weights: {weights}")
+    model = trained_model(config)
+    model = model.to("cuda" if torch.cuda.is_available() else "cpu")
+    generator = DiffusionGenerator(model, config.sampler)
     # A generated view brings no depth along.
     own = config.depth
     source = StereoConfig() if isinstance(own, DatasetDepthConfig) else own
@@ -204,7 +207,28 @@ def _plan_text(known: GlobalMap, order: list[Query]) -> str:
     )
 
 
-def _completed(job: _Job, known: GlobalMap, queries: list[Query], workshop: Workshop) -> GlobalMap:
+@contextmanager
+def _viewer(job: _Job, known: GlobalMap, console: Console) -> Iterator[CloudViewer | None]:
+    """The page, where it is wanted; it stays until its visitor ends it."""
+    options = job.config.complete
+    if not options.viewer:
+        yield None
+        return
+    with CloudViewer(options.port, options.confidence.votes) as viewer:
+        viewer.show(known)
+        console.print(f"viewer: http://localhost:{viewer.port}")
+        yield viewer
+        if sys.stdin.isatty():
+            input("the scene is complete; Enter closes the viewer and writes the results ")
+
+
+def _completed(
+    job: _Job,
+    known: GlobalMap,
+    queries: list[Query],
+    workshop: Workshop,
+    viewer: CloudViewer | None,
+) -> GlobalMap:
     folder = job.folder / "map"
     there = {view.view.name for view in known.views}
     left = sum(query.name not in there for query in queries)
@@ -213,15 +237,8 @@ def _completed(job: _Job, known: GlobalMap, queries: list[Query], workshop: Work
         def on_step(grown: GlobalMap, added: MapView, step: Step) -> None:
             save_step(step, folder, len(grown) - 1)
             save_view(added, folder, len(grown) - 1)
+            if viewer is not None:
+                viewer.show(grown)
             bar.update()
 
         return complete(known, queries, workshop, on_step)
-
-
-def map_digest(known: GlobalMap) -> str:
-    """Equal for equal maps, bit for bit."""
-    digest = hashlib.sha256()
-    for view in known.views:
-        for tensor in (view.view.image, view.depth, view.confidence, view.fresh):
-            digest.update(tensor.contiguous().numpy().tobytes())
-    return digest.hexdigest()

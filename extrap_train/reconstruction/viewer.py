@@ -1,0 +1,122 @@
+"""The growing cloud in a browser (viser, the extra `viewer`)."""
+
+import math
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import roma
+from jaxtyping import Float
+
+from extrap_train.data.images import to_eight_bits
+from extrap_train.errors import InputError
+from extrap_train.reconstruction.cloud import PointCloud, cloud_of
+from extrap_train.reconstruction.global_map import GIVEN, GlobalMap, MapView
+
+GIVEN_COLOUR = (40, 110, 220)
+GENERATED_COLOUR = (235, 130, 30)
+POINT_SIZE = 0.004
+"""In units of the cameras' distance from the scene."""
+FRUSTUM_SCALE = 0.08
+
+
+class CloudViewer:
+    """A page with the cloud, the cameras, a slider over the steps and a least confidence.
+
+    Given views have blue frusta, generated ones orange. `show` may be called again and again; the
+    page follows the newest step unless its visitor has gone back to an earlier one.
+    """
+
+    def __init__(self, port: int, votes: bool = True) -> None:
+        try:
+            import viser
+        except ImportError:
+            raise InputError(
+                'viewer=true needs viser: pip install "extrap-train[viewer]"'
+            ) from None
+        self._votes = votes
+        self._cloud: PointCloud | None = None
+        self._known: GlobalMap | None = None
+        self._frusta: dict[int, Any] = {}
+        self._server = viser.ViserServer(port=port, verbose=False)
+        gui: Any = self._server.gui  # its typing makes values read-only
+        self._step = gui.add_slider("views", min=1, max=2, step=1, initial_value=1)
+        self._least = gui.add_slider("least confidence", 0.0, 1.0, 0.05, 0.1)
+        self._count = gui.add_text("points", "0", disabled=True)
+        self._step.on_update(lambda _: self._draw())
+        self._least.on_update(lambda _: self._draw())
+
+    @property
+    def port(self) -> int:
+        """Where the page is: the wanted port, or the next free one."""
+        return int(self._server.get_port())
+
+    @property
+    def shown_points(self) -> int:
+        """Points on the page."""
+        return int(self._count.value)
+
+    def select(self, views: int, least_confidence: float) -> None:
+        """What the sliders do."""
+        self._step.value, self._least.value = views, least_confidence
+        self._draw()
+
+    def show(self, known: GlobalMap) -> None:
+        """Put a map on the page."""
+        following = self._known is None or self._step.value == len(self._known)
+        self._known = known
+        self._cloud = cloud_of(known, votes=self._votes)
+        self._step.max = max(2, len(known))
+        for index, view in enumerate(known.views):
+            self._add_frustum(index, view)
+        if following:
+            self._step.value = len(known)
+        self._draw()
+
+    def close(self) -> None:
+        """Take the page down."""
+        self._server.stop()
+
+    def __enter__(self) -> "CloudViewer":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _draw(self) -> None:
+        if self._cloud is None or self._known is None:
+            return
+        views = int(self._step.value)
+        kept = (self._cloud.view < views) & (self._cloud.confidence >= self._least.value)
+        cloud = self._cloud[kept]
+        self._server.scene.add_point_cloud(
+            "/cloud", cloud.points.numpy(), to_eight_bits(cloud.colors), point_size=POINT_SIZE
+        )
+        self._count.value = str(len(cloud))
+        for index in range(len(self._known)):
+            self._frusta[index].visible = index < views
+
+    def _add_frustum(self, index: int, view: MapView) -> None:
+        if index in self._frusta:
+            return
+        camera = view.camera
+        given = view.origin.kind == GIVEN
+        pose: Float[np.ndarray, "4 4"] = camera.cam_to_world.double().numpy()
+        quaternion = roma.quat_xyzw_to_wxyz(
+            roma.rotmat_to_unitquat(camera.cam_to_world[:3, :3].double())
+        )
+        self._frusta[index] = self._server.scene.add_camera_frustum(
+            f"/cameras/{'given' if given else 'generated'}/{view.view.name}",
+            fov=2 * math.atan(camera.height / 2 / float(camera.intrinsics[1, 1])),
+            aspect=camera.width / camera.height,
+            scale=FRUSTUM_SCALE,
+            color=GIVEN_COLOUR if given else GENERATED_COLOUR,
+            image=to_eight_bits(view.view.image).transpose(1, 2, 0),
+            wxyz=quaternion.numpy(),
+            position=pose[:3, 3],
+        )
