@@ -126,9 +126,7 @@ def _run(
             status.update(f"preparing draws: {number + 1} of {len(draws)}")
     jobs = cell_jobs(table, folder, protocol, methods, scenes)
     done, waiting = finished(jobs, folder, console.print)
-    console.print(
-        f"{len(jobs)} cells: {len(done)} are finished and used again, {len(waiting)} open"
-    )
+    console.print(f"{len(jobs)} cells: {len(done)} finished and used again, {len(waiting)} open")
     if options.dry_run:
         _print_plan(jobs, waiting, folder, console)
         return 0
