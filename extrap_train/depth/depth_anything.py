@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -58,6 +59,8 @@ def read_depth_anything(model: str) -> DepthAnything:
     except InputError:
         raise
     except _UNUSABLE as error:
+        if not Path(model).is_dir() and isinstance(error, OSError):
+            raise _refusal(model, "is neither a folder nor in the cache of downloads") from None
         reason = str(error).strip().split("\n")[0] or type(error).__name__
         raise _refusal(model, f"cannot be read ({reason})") from None
     network, said = loaded

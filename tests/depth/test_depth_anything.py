@@ -88,8 +88,8 @@ def refused(model, said):
 
 
 def test_absent(tmp_path):
-    refused(tmp_path / "nowhere", "cannot be read")
-    refused("nobody/no-such-model", "cannot be read")
+    refused(tmp_path / "nowhere", "is neither a folder nor in the cache of downloads")
+    refused("nobody/no-such-model", "is neither a folder nor in the cache of downloads")
 
 
 def test_another_model(folder):

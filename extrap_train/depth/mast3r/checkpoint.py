@@ -31,14 +31,14 @@ def read_network(path: Path, option: str = "depth.checkpoint") -> PointMapNetwor
     try:
         with torch.device("meta"):
             network = PointMapNetwork(architecture_of(state, expression))
-    except (KeyError, ValueError, ZeroDivisionError) as error:
+    except (ValueError, ZeroDivisionError) as error:
         raise file.refusal(f"is another network's ({error})") from None
     file.fill(network, state)
     return network.eval().requires_grad_(False)
 
 
 def architecture_of(state: Mapping[str, Tensor], expression: str = "") -> Architecture:
-    """Sizes from a state dict's names and shapes; KeyError or ValueError if it is of another kind.
+    """Sizes from a state dict's names and shapes; ValueError if it is of another kind.
 
     `expression` is the text that may say `enc_num_heads=…` and `dec_num_heads=…`.
     """
@@ -63,7 +63,7 @@ def architecture_of(state: Mapping[str, Tensor], expression: str = "") -> Archit
 
 def _shape(state: Mapping[str, Tensor], name: str, dimensions: int) -> tuple[int, ...]:
     if name not in state or state[name].dim() != dimensions:
-        raise KeyError(f"no {name} of {dimensions} dimensions")
+        raise ValueError(f"no {name} of {dimensions} dimensions")
     return tuple(state[name].shape)
 
 
