@@ -1,26 +1,32 @@
 """What was prepared, to look at: printed, and saved as a page with pictures."""
 
-import io
+from collections import Counter
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import torch
+from jinja2 import Environment, Template
 from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
+from data_prep.report_pairs import (
+    as_png,
+    correction_report,
+    pair_sheet,
+    share_corrected,
+    without_numbers,
+)
 from extrap_train.data.files import write_whole
 from extrap_train.data.store import Pairs, PreparedData
 from extrap_train.geometry.viewpoints import fit_orbit
-from extrap_train.geometry.warp import warp_references
-from extrap_train.pictures import colour_depth, contact_sheet, mark_holes
-from extrap_train.views import ViewPair, stack_cameras
 
 SAMPLES = 8
 """Pairs on the picture sheet, from the easiest to the hardest."""
-_LISTED = 40
+_LISTED = 200
 """Dropped sequences that the page names one by one."""
+_REASONS = 20
 _COLOURS = {"train": "tab:blue", "test": "tab:orange"}
 
 
@@ -29,13 +35,43 @@ def write_report(data: PreparedData, console: Console) -> Path:
     folder = data.folder / "report"
     facts = summary(data)
     dropped = data.sequences[~data.sequences["kept"]]
-    _print(facts, dropped, console)
-    write_whole(folder / "histograms.png", _png(histograms(data)))
-    write_whole(folder / "coverage.png", _png(coverage(data)))
-    picture_sheet(data, folder / "pairs.png")
-    page = folder / "report.md"
-    write_whole(page, _markdown(facts, dropped).encode())
+    reasons = _reasons(dropped)
+    _print(facts, reasons, console)
+    write_whole(folder / "histograms.png", as_png(histograms(data)))
+    write_whole(folder / "coverage.png", as_png(coverage(data)))
+    pairs = data.pairs("train")
+    pair_sheet(data, _from_easy_to_hard(pairs, SAMPLES), folder / "pairs.png")
+    listed = list(dropped[["sequence", "reason"]].head(_LISTED).itertuples(index=False, name=None))
+    page = folder / "report.html"
+    content = _page().render(
+        title=f"Prepared data: {', '.join(_categories(data))}",
+        facts=facts,
+        reasons=reasons,
+        dropped=listed,
+        unlisted=len(dropped) - len(listed),
+        **correction_report(data, folder),
+    )
+    write_whole(page, content.encode())
+    console.print(f"report: {page}")
     return page
+
+
+def _page() -> Template:
+    """The page's template; everything that it is filled with is escaped."""
+    source = files("data_prep").joinpath("templates/report.html").read_text("utf-8")
+    return Environment(autoescape=True, trim_blocks=True).from_string(source)
+
+
+def _categories(data: PreparedData) -> list[str]:
+    return sorted({name.split("/", 1)[0] for name in data.sequences["sequence"]})
+
+
+def _reasons(dropped: pd.DataFrame) -> list[tuple[str, int]]:
+    """What sequences were left out for, numbers and names taken off, the most frequent first."""
+    rows = zip(dropped["sequence"], dropped["reason"], strict=True)
+    plain = (reason.removeprefix(f"sequence {name}: ") for name, reason in rows)
+    kinds = Counter(without_numbers(reason) for reason in plain)
+    return kinds.most_common(_REASONS)
 
 
 def summary(data: PreparedData) -> dict[str, str]:
@@ -55,6 +91,8 @@ def summary(data: PreparedData) -> dict[str, str]:
         if len(pairs):
             low, middle, high = np.degrees(np.quantile(pairs.angle_rad, (0.05, 0.5, 0.95)))
             facts[f"{split} angles"] = f"{low:.0f}° to {high:.0f}°, median {middle:.0f}°"
+    if data.is_corrected:
+        facts["warps corrected"] = share_corrected(data)
     facts["split"] = f"sha256 {data.manifest['split'][:16]}…"
     return facts
 
@@ -91,32 +129,6 @@ def coverage(data: PreparedData) -> Figure:
     return figure
 
 
-def picture_sheet(data: PreparedData, path: Path) -> None:
-    """Training pairs from the smallest to the largest angle: reference, depth, warp, query."""
-    pairs = data.pairs("train")
-    chosen = _from_easy_to_hard(pairs, SAMPLES)
-    views = [data.frames(p.sequence, [p.references[0], p.query]) for p in chosen]
-    images = torch.stack([images for images, _, _ in views])
-    depths = torch.stack([depths for _, depths, _ in views])
-    cameras = stack_cameras(
-        [data.cameras(p.sequence)[torch.tensor([p.references[0], p.query])] for p in chosen]
-    )
-    warp = warp_references(
-        images[:, :1],
-        depths[:, :1],
-        cameras[:, :1],
-        torch.ones(len(chosen), 1, dtype=torch.bool),
-        cameras[:, 1],
-    )
-    columns = {
-        "reference": images[:, 0],
-        "its depth": colour_depth(depths[:, 0]),
-        "warp (holes magenta)": mark_holes(warp.image, warp.mask),
-        "query": images[:, 1],
-    }
-    contact_sheet(columns, path)
-
-
 def _evenly(available: int, wanted: int) -> list[int]:
     """At most `wanted` indices, evenly over those there are."""
     return (
@@ -126,40 +138,15 @@ def _evenly(available: int, wanted: int) -> list[int]:
     )
 
 
-def _from_easy_to_hard(pairs: Pairs, count: int) -> list[ViewPair]:
+def _from_easy_to_hard(pairs: Pairs, count: int) -> list[int]:
     order = np.argsort(pairs.angle_rad, kind="stable")
-    return [pairs[int(order[place])] for place in _evenly(len(pairs), count)]
+    return [int(order[place]) for place in _evenly(len(pairs), count)]
 
 
-def _print(facts: dict[str, str], dropped: pd.DataFrame, console: Console) -> None:
+def _print(facts: dict[str, str], reasons: list[tuple[str, int]], console: Console) -> None:
     table = Table(title="prepared data", show_header=False)
     for what, value in facts.items():
         table.add_row(what, value)
-    for reason, count in dropped["reason"].value_counts().head(5).items():
-        table.add_row(f"dropped: {count}", str(reason))
+    for reason, count in reasons[:5]:
+        table.add_row(f"left out: {count}", reason)
     console.print(table, markup=False)
-
-
-def _markdown(facts: dict[str, str], dropped: pd.DataFrame) -> str:
-    lines = ["# Prepared data", "", "| | |", "|---|---|"]
-    lines += [f"| {what} | {value} |" for what, value in facts.items()]
-    lines += ["", "![pairs](pairs.png)", "", "![histograms](histograms.png)", ""]
-    lines += ["![coverage](coverage.png)", "", f"## Dropped sequences: {len(dropped)}", ""]
-    if len(dropped):
-        lines += ["| sequence | reason |", "|---|---|"]
-    for name, reason in dropped[["sequence", "reason"]].head(_LISTED).itertuples(index=False):
-        lines.append(f"| {_cell(name)} | {_cell(reason)} |")
-    if len(dropped) > _LISTED:
-        lines += ["", f"… and {len(dropped) - _LISTED} more in `sequences.parquet`."]
-    return "\n".join(lines) + "\n"
-
-
-def _cell(text: str) -> str:
-    """Untrusted text for a table's cell."""
-    return " ".join(text.split()).replace("\\", "\\\\").replace("|", "\\|").replace("<", "&lt;")
-
-
-def _png(figure: Figure) -> bytes:
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=100)
-    return content.getvalue()

@@ -1,13 +1,16 @@
 """Cameras on orbits and captures made of them, in memory."""
 
 from collections.abc import Callable, Collection
+from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scenes import SPHERE_ON_PLANE, orbit_camera
 
 from extrap_train.data.sequences import Frame, Sequence
 from extrap_train.errors import InputError
-from extrap_train.views import Camera, View
+from extrap_train.geometry.cameras import unproject_to_world
+from extrap_train.views import Camera, View, stack_cameras
 
 
 def looking_at(
@@ -71,3 +74,46 @@ def capture(
         for i in range(count)
     )
     return Sequence("cup", name, frames, **quality)
+
+
+@dataclass(frozen=True)
+class _Textured:
+    """Loads a frame of a textured sphere before a wall; a dataclass, so that it can be pickled."""
+
+    camera: Camera
+    name: str
+    depth_factor: float
+    broken: bool
+
+    def load(self) -> View:
+        if self.broken:
+            raise InputError(f"{self.name}.jpg: truncated; restore it")
+        exact = SPHERE_ON_PLANE.depth(self.camera)
+        world = unproject_to_world(exact[None], stack_cameras([self.camera]))[0]
+        waves = 9 * torch.randn(3, 40, generator=torch.Generator().manual_seed(5))
+        fine = torch.sin(world @ waves + torch.arange(40.0)).unflatten(-1, (4, 10)).mean(-1)
+        image = SPHERE_ON_PLANE.image(self.camera) + 0.8 * fine[..., :3].permute(2, 0, 1)
+        depth = exact * self.depth_factor
+        return View(image.clamp(0, 1), self.camera, depth.clamp(max=50), None, self.name)
+
+
+def textured_capture(
+    name: str,
+    count: int = 12,
+    size: int = 64,
+    depth_factor: float = 1.04,
+    broken: Collection[int] = (),
+) -> Sequence:
+    """A full circle around a textured sphere, whose depths are all too large by a factor."""
+    cameras = [orbit_camera(360 * i / count, size=size) for i in range(count)]
+    frames = tuple(
+        Frame(
+            f"frame{i}",
+            camera,
+            True,
+            False,
+            _Textured(camera, f"frame{i}", depth_factor, i in broken).load,
+        )
+        for i, camera in enumerate(cameras)
+    )
+    return Sequence("cup", name, frames)

@@ -1,6 +1,7 @@
 """Jobs as one SLURM job array, through submitit."""
 
 import shutil
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -94,7 +95,10 @@ def slurm_launcher(config: SlurmConfig, folder: Path) -> SubmittedLauncher:
             "launcher=slurm: there is no sbatch on this machine; submit from a login node of the "
             "cluster, or leave launcher=local"
         )
-    executor = submitit.SlurmExecutor(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    # A folder of its own: a cluster that was set up anew gives old numbers to new jobs, whose
+    # results would be found there already.
+    executor = submitit.SlurmExecutor(tempfile.mkdtemp(dir=folder))
     optional = {"partition": config.partition, "account": config.account}
     executor.update_parameters(
         job_name="extrap-train",

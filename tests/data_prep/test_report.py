@@ -2,21 +2,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from orbits import capture, even, ring
+from orbits import capture, even, ring, textured_capture
 from PIL import Image
 from rich.console import Console
 
 from data_prep.build import prepare
 from data_prep.report import write_report
-from extrap_train.config import PrepConfig
+from extrap_train.config import FlowMatcherConfig, PrepConfig
 from extrap_train.data.store import PreparedData
 from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.matching.flow import FlowMatcher
 
 
 @pytest.fixture
 def data(tmp_path: Path) -> PreparedData:
     sequences = [capture(ring(even(24)), str(i)) for i in range(3)]
-    sequences += [capture(ring(even(24, 90)), "evil|name\n[red]")]
+    sequences += [capture(ring(even(24, 90)), "evil|name\n[red] <script>")]
     options = PrepConfig(image_size=16)
     return prepare(
         sequences, DatasetDepth(), options, test_names=1, folder=tmp_path / "cup", progress=False
@@ -26,18 +27,20 @@ def data(tmp_path: Path) -> PreparedData:
 def test_the_page_says_what_was_kept_and_why_not(data: PreparedData) -> None:
     console = Console(record=True, width=120, quiet=False, file=None)
     page = write_report(data, console).read_text()
-    assert "| sequences kept | 3 of 4 |" in page
-    assert f"| train pairs | {len(data.pairs('train'))} |" in page
-    assert r"| cup/evil\|name [red] | covers 86°" in page
+    assert "<th>sequences kept</th><td>3 of 4</td>" in page
+    assert f"<th>train pairs</th><td>{len(data.pairs('train'))}</td>" in page
+    assert "<td>cup/evil|name\n[red] &lt;script&gt;</td><td>covers 86°" in page
+    assert "<script" not in page
+    assert "covers #° &lt; #°" in page
     printed = console.export_text()
     assert "3 of 4" in printed
-    assert "covers 86°" in printed
+    assert "covers #°" in printed
 
 
 def test_its_pictures_are_there_and_not_blank(data: PreparedData) -> None:
     page = write_report(data, Console(quiet=True))
     for name in ("pairs", "histograms", "coverage"):
-        assert f"]({name}.png)" in page.read_text()
+        assert f'src="{name}.png"' in page.read_text()
         assert np.asarray(Image.open(page.with_name(f"{name}.png"))).std() > 5
 
 
@@ -51,4 +54,26 @@ def test_a_lone_sequence_without_test_pairs_has_a_report_too(tmp_path: Path) -> 
         folder=tmp_path / "cup",
         progress=False,
     )
-    assert "| test pairs | 0 |" in write_report(data, Console(quiet=True)).read_text()
+    assert "<th>test pairs</th><td>0</td>" in write_report(data, Console(quiet=True)).read_text()
+
+
+def test_corrections_and_the_worst_pairs_are_shown(tmp_path: Path) -> None:
+    data = prepare(
+        [textured_capture(str(i)) for i in range(2)],
+        DatasetDepth(),
+        PrepConfig(image_size=64, max_uses=4),
+        test_names=1,
+        folder=tmp_path / "cup",
+        matcher=FlowMatcher(FlowMatcherConfig()),
+        progress=False,
+    )
+    pairs = data.pairs("train")
+    page = write_report(data, Console(quiet=True))
+    text = page.read_text()
+    assert f"The worst {min(20, len(pairs))} pairs" in text
+    worst = np.nanmax(pairs.error_after)
+    assert f'<td class="number">{worst:.4f}</td>' in text
+    assert (pairs.flow >= 0).any()
+    assert "photometric error taken away" in text
+    for name in ("worst", "correction"):
+        assert np.asarray(Image.open(page.with_name(f"{name}.png"))).std() > 5
