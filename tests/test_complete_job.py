@@ -105,6 +105,7 @@ def test_what_is_written_is_read_back_by_the_readers_of_other_captures(
         assert 0.5 < float(view.depth.median()) < 6
 
 
+@pytest.mark.slow
 def test_killed_between_and_inside_views_the_result_is_the_same(
     undisturbed: Path, tmp_path: Path
 ) -> None:

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 
 from extrap_train.data.synthetic import SyntheticScene, surface_points
 from extrap_train.geometry.viewpoints import directions_from, scene_center
@@ -73,7 +72,7 @@ def view_consistency(known: GlobalMap) -> float | None:
 def coverage_of(known: GlobalMap) -> dict[str, float]:
     """Share of the sphere of viewing directions that views stand within 20° of."""
     directions = directions_from(known.cameras, scene_center(known.cameras))
-    given: Float[np.ndarray, "n"] = np.array([v.origin.kind != GENERATED for v in known.views])
+    given = np.array([v.origin.kind != GENERATED for v in known.views])
     return {
         "inputs": sphere_coverage(directions[given], float(SEEN_WITHIN_RAD)),
         "completed": sphere_coverage(directions, float(SEEN_WITHIN_RAD)),

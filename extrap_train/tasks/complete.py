@@ -2,7 +2,10 @@
 
 import json
 import shutil
+import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -35,6 +38,7 @@ from extrap_train.reconstruction.inputs import (
 from extrap_train.reconstruction.map_files import load_map, load_steps, save_step, save_view
 from extrap_train.reconstruction.planner import Query, expected_order, orbit_queries
 from extrap_train.reconstruction.pose_check import check_poses
+from extrap_train.reconstruction.viewer import CloudViewer
 from extrap_train.tasks.completed import Completed, write_completed
 from extrap_train.tasks.scene_inputs import trained_model
 from extrap_train.views import stack_cameras, stack_poses
