@@ -70,7 +70,7 @@ def parameters_from_points(
     InputError without points, or where one is not finite.
     """
     if not len(points):
-        raise InputError("no initial points: the input views share no features; use init=random")
+        raise InputError("no initial points in features or depth of the inputs; use init=random")
     if not (points.positions.isfinite().all() and points.colors.isfinite().all()):
         raise InputError("an initial point is not finite; check the depth and the poses given")
     count = len(points)
