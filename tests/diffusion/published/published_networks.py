@@ -2,8 +2,11 @@
 
 from dataclasses import dataclass
 
+import hydra
+from omegaconf import OmegaConf
 from torch import Tensor
 
+from extrap_train.cli import register_schemas
 from extrap_train.config import ClipConfig, ModelConfig, UNetConfig, VaeConfig
 
 FAMILIES = ("zeronvs", "megascenes")
@@ -39,3 +42,13 @@ def tiny_config(family: str, **changed: object) -> ModelConfig:
         "unet": TINY_UNET,
     }
     return ModelConfig(**(options | changed))  # type: ignore[arg-type]
+
+
+def configured(name: str) -> ModelConfig:
+    """`model=name` as the command line composes it."""
+    register_schemas()
+    with hydra.initialize_config_module("conf", version_base="1.3"):
+        composed = hydra.compose("train", ["category=hydrant", f"model={name}"])
+    typed = OmegaConf.to_object(composed.model)
+    assert isinstance(typed, ModelConfig)
+    return typed

@@ -3,25 +3,13 @@
 import json
 from pathlib import Path
 
-import hydra
 import pytest
 import torch
-from omegaconf import OmegaConf
+from published_networks import configured
 from torch import Tensor
 
-from extrap_train.cli import register_schemas
-from extrap_train.config import ModelConfig
 from extrap_train.diffusion.checkpoint import load_weights
 from extrap_train.diffusion.model import ExtrapolationModel
-
-
-def _configured(name: str) -> ModelConfig:
-    register_schemas()
-    with hydra.initialize_config_module("conf", version_base="1.3"):
-        composed = hydra.compose("train", ["category=hydrant", f"model={name}"])
-    typed = OmegaConf.to_object(composed.model)
-    assert isinstance(typed, ModelConfig)
-    return typed
 
 
 def _layout(folder: Path, family: str) -> dict[str, Tensor]:
@@ -48,7 +36,7 @@ def test_the_published_layout_loads(
 ) -> None:
     torch.save({"state_dict": _layout(shared / "layouts", layout)}, tmp_path / "weights.ckpt")
     with torch.device("meta"):
-        network = ExtrapolationModel(_configured(model))
+        network = ExtrapolationModel(configured(model))
     load_weights(network, tmp_path / "weights.ckpt")
     counted = {p: sum(x.numel() for x in n.parameters()) for p, n in network.parts().items()}
     assert counted["unet"] == denoiser_parameters
