@@ -47,7 +47,7 @@ def configuration(size: Size) -> ModelConfig:
     return ModelConfig(
         name="perf",
         image_size=IMAGE_SIZE,
-        vae=VaeConfig(channels=[32 * round(narrow / 80) * x for x in (1, 2, 4, 4)]),
+        vae=VaeConfig(channels=[32 * max(1, round(narrow / 80)) * x for x in (1, 2, 4, 4)]),
         clip=ClipConfig(width=64 * (narrow // 20), heads=narrow // 20),
         residual=False,
         prediction="epsilon",
