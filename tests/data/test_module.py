@@ -78,7 +78,7 @@ def _single(camera: Camera) -> Camera:
 
 @pytest.fixture
 def wall_batch() -> PairBatch:
-    from diffusion.conftest import batch_of
+    from diffusion.batches import batch_of
 
     return batch_of(1)
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from conftest import batch_of
+from batches import batch_of
 
 from extrap_train.config import SamplerConfig
 from extrap_train.diffusion.guidance import acts, guidance_weights, guided

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 import torch
-from tests.depth.traced_scenes import SCENES, orbit_camera, render
 
 from benchmarks.methods.gaussians.sift import epipolar_distance, projection_matrices
 from benchmarks.methods.gaussians.triangulate import triangulate, triangulated_points
 from extrap_train.geometry.cameras import project
 from extrap_train.views import View
 from tests.scenes import orbit_camera as analytic_camera
+from tests.traced_scenes import SCENES, orbit_camera, render
 
 
 @pytest.fixture(scope="module")
