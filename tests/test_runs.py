@@ -8,6 +8,7 @@ import pytest
 from extrap_train.config import (
     CategoryConfig,
     Co3dConfig,
+    FlowMatcherConfig,
     ModelConfig,
     SyntheticConfig,
     TrainConfig,
@@ -23,6 +24,7 @@ def config(tmp_path: Path) -> TrainConfig:
         category=CategoryConfig("hydrant", ["hydrant"]),
         data=SyntheticConfig(),
         depth=Depth(),
+        matcher=FlowMatcherConfig(),
         model=ModelConfig(name="small"),
         output=str(tmp_path),
     )

@@ -7,6 +7,7 @@ import io
 import os
 import pickle
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,8 @@ class WholeCheckpointIO(TorchCheckpointIO):
                 f"{path}: cannot be written ({reason}); free space or choose another output="
             ) from None
         finally:
-            temporary.unlink(missing_ok=True)
+            with suppress(OSError):  # the folder itself may be what cannot be written
+                temporary.unlink(missing_ok=True)
 
     def load_checkpoint(
         self,

@@ -8,12 +8,13 @@ from extrap_train.config import SyntheticConfig
 from extrap_train.data.co3d import read_category
 from extrap_train.data.scene import open_scene
 from extrap_train.errors import InputError
+from extrap_train.jobs.local import LocalLauncher
 
 SMALL = SyntheticConfig(test_sequences=1, train_sequences=1, frames=3, image_size=24)
 
 
 def test_it_is_what_lies_on_disk_before_compression(tmp_path):
-    synthesize(SMALL, "cup", tmp_path, workers=1)
+    synthesize(SMALL, "cup", tmp_path, LocalLauncher(1))
     stored = read_category(tmp_path, "cup")[1]
     rendered = open_scene("synthetic:cup/0001", SMALL)
     assert (rendered.category, rendered.name) == ("cup", stored.name) == ("cup", "0001")
