@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from extrap_train.config.commands import DataPrepConfig, TrainConfig
@@ -35,6 +36,7 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "launcher.memory_gib": (0.5, 4096),
     "launcher.hours": (0.02, 10_000),
     "prep.image_size": (1, 4096),
+    "model.image_size": (8, 4096),
     "prep.correction_grid": (4, 64),
     "prep.max_uses": (1, math.inf),
     "model.patch": (1, 64),
@@ -96,6 +98,8 @@ def validate(config: TrainConfig | DataPrepConfig, tasks: tuple[str, ...]) -> No
     _check_prep(config.prep)
     if isinstance(config.data, Co3dConfig) and not config.data.root:
         raise InputError("data=co3d needs the folder of the download: give data.root=FOLDER")
+    if config.data.root and isinstance(config.data, Co3dConfig):
+        _check_folder(config.data.root)
     _check_files(config)
     if isinstance(config, TrainConfig):
         _check_one_of("task", config.task, tasks)
@@ -197,6 +201,12 @@ def _check_completion(complete: CompletionConfig) -> None:
     _check_one_of("complete.draw", complete.draw, ("one_sided", "spread"))
     _check_one_of("complete.poses", complete.poses, ("orbit", "capture"))
     _check_one_of("complete.generator", complete.generator, ("model", "exact"))
+
+
+def _check_folder(root: str) -> None:
+    """Before anything is written: a wrong root must not leave a run behind."""
+    if not Path(root).is_dir():
+        raise InputError(f"data.root={root}: no such folder; give the folder of the download")
 
 
 def _check_one_of(name: str, value: str, known: tuple[str, ...]) -> None:

@@ -33,7 +33,9 @@ def with_warp(batch: PairBatch, image_size: int | None = None) -> PairBatch:
         batch.camera,
         batch.reference_flows,
     )
-    factor = 1 if image_size is None else batch.camera.height // image_size
+    factor, rest = divmod(batch.camera.height, image_size or batch.camera.height)
+    if rest or not factor:
+        raise ValueError(f"{batch.camera.height} pixels are no multiple of {image_size}")
     return reduced_batch(replace(batch, warp=warp), factor)
 
 
@@ -79,7 +81,7 @@ class PositionSampler(Sampler[Positions]):
 
 
 class TrainingBatches(Dataset[PairBatch]):
-    """Whole batches by their positions: one to `k` references, every other example mirrored."""
+    """Whole batches by their positions: one to `references` photographs, half mirrored."""
 
     def __init__(self, reader: ExampleReader, references: int, seed: int) -> None:
         self.reader, self.references, self.seed = reader, references, seed

@@ -10,9 +10,10 @@ from torch import Tensor
 from torch.nn import functional
 
 _COARSEST_CELLS = 16
-"""A side, of the coarsest level. Measured on held-out views: what lies beyond a hole wider than
-1/16 of the picture is rather like the picture's mean than like the hole's rim, which is mostly the
-object's.
+"""On the shorter side of the coarsest level, about.
+
+Measured on held-out views: what lies beyond a hole wider than 1/16 of the picture is rather like
+the picture's mean than like the hole's rim, which is mostly the object's.
 """
 
 

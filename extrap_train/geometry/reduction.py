@@ -19,7 +19,8 @@ WARP_SCALE = 2
 def reduced_batch(batch: PairBatch, factor: int) -> PairBatch:
     """The batch with everything in it, its warp too, at 1/`factor` of its size.
 
-    Colours are averaged; depth, which has edges, is taken from one pixel in each block.
+    Colours are averaged; depth, which has edges, is taken from one pixel in each block, half a fine
+    pixel off the block's middle.
     """
     if factor == 1:
         return batch
@@ -62,6 +63,9 @@ def _known_mean(
     share: Float[Tensor, "b 1 h2 w2"],
     factor: int,
 ) -> Float[Tensor, "b c h2 w2"]:
-    """Mean of each block over the pixels where `mask` is 1, `share` of them; 0 where none is."""
+    """Mean of each block over the pixels where `mask` is 1; 0 where none is.
+
+    `share` is the part of each block that is known.
+    """
     total = functional.avg_pool2d(values * mask[:, None], factor)
     return total / share.clamp_min(1e-6)

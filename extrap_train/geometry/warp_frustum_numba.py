@@ -20,8 +20,9 @@ def enters(
 ) -> bool:
     """Whether any of a pixel's surface may lie in the query's image, or within `_RIM` of it.
 
-    Exact but for the rim: in homogeneous coordinates each side of the image is a linear function of
-    the place in each quarter of the pixel, so its greatest value lies at a corner.
+    Never wrongly no; wrongly yes at most near the image's corners. In homogeneous coordinates each
+    side of the image is a linear function of the place in each quarter of the pixel, so its
+    greatest value lies at a corner.
     """
     height, width = np.float32(size[0]), np.float32(size[1])
     return bool(
