@@ -11,6 +11,7 @@ from benchmarks.methods.references import nearest_inputs, views_with_depth
 from extrap_train.data.module import with_warp
 from extrap_train.data.queries import query_batch
 from extrap_train.diffusion.baselines import inpainted_warp
+from extrap_train.geometry.reduction import WARP_SCALE
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,9 @@ class InpaintedWarp:
         """Warp and inpaint every target."""
         with Stopwatch() as watch:
             views, size = views_with_depth(inputs), inputs.targets.height
-            batch = with_warp(query_batch(views, inputs.targets, self.references, size)[0])
+            fine = WARP_SCALE * size  # as our own warps are made: no rival gets a worse one
+            batch = query_batch(views, inputs.targets, self.references, fine)[0]
+            batch = with_warp(batch, size)
             assert batch.warp is not None
             images = inpainted_warp(batch.warp).clamp(0, 1)
         return Synthesis(images, watch.seconds / len(images))
