@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from extrap_train.config import DatasetDepthConfig, PrepConfig, SyntheticConfig
+from extrap_train.config import DatasetDepthConfig, FlowMatcherConfig, PrepConfig, SyntheticConfig
 from extrap_train.data.examples import ExampleReader
 from extrap_train.data.module import ValidationBatches, spread, with_warp
 from extrap_train.diffusion.baselines import mean_filled_warp
@@ -27,7 +27,13 @@ def _held_out(output: Path) -> tuple[PairBatch, Bool[Tensor, "b 1 h w"], Bool[Te
     """The held-out hydrant views of the first command, with their object and what lies far."""
     data = SyntheticConfig(train_sequences=1)
     prepared = prepare_category(
-        "hydrant", data, DatasetDepthConfig(), PrepConfig(), output=output, workers=2
+        "hydrant",
+        data,
+        DatasetDepthConfig(),
+        PrepConfig(),
+        output=output,
+        workers=2,
+        matcher=FlowMatcherConfig(),
     )
     reader, pairs = ExampleReader([prepared], "test", _REFERENCES), prepared.pairs("test")
     chosen = spread(len(reader), _VIEWS)

@@ -31,7 +31,7 @@ def handheld_orbit(scene: SyntheticScene, frames: int, image_size: int, seed: in
     azimuth = 2 * np.pi * (steps + rng.uniform()) * rng.choice([-1, 1])
     azimuth = azimuth + rng.normal(0, 0.15, frames).clip(-0.3, 0.3) * 2 * np.pi / frames
     wave = _slow_wave(rng, steps)
-    elevation = np.deg2rad(np.clip(rng.uniform(18, 32) + 8 * wave, 10, 40))
+    elevation = np.deg2rad(np.clip(rng.uniform(30, 44) + 6 * wave, 22, 50))
     fill = rng.uniform(0.68, 0.84) * (1 + 0.06 * _slow_wave(rng, steps))
     distance = scene.radius / np.sin(np.arctan(np.tan(field_of_view / 2) * fill))
     out = np.stack(
