@@ -109,7 +109,7 @@ def _check(name: str, arguments: list[str]) -> None:
         if not any(o.startswith(("category=", "experiment=")) for o in overrides):
             sys.argv.append("category=hydrant")  # help shows a whole tree
         return
-    if {"-m", "--multirun", "--hydra-help", "--version"} & set(arguments):
+    if {"-m", "--multirun", "--hydra-help", "--version", "--info", "-i"} & set(arguments):
         return
     try:
         with hydra.initialize_config_module("conf", version_base="1.3"):
@@ -119,7 +119,13 @@ def _check(name: str, arguments: list[str]) -> None:
 
 
 def _overrides(arguments: list[str]) -> list[str]:
-    return [argument for argument in arguments if not argument.startswith("-")]
+    """What is left without flags and the value that some of Hydra's take."""
+    valued = {"--cfg", "-c", "--package", "-p", "--config-name", "-cn", "--config-dir", "-cd"}
+    return [
+        argument
+        for before, argument in zip(["", *arguments], arguments, strict=False)
+        if not argument.startswith("-") and before not in valued
+    ]
 
 
 def _one_line(error: Exception, overrides: list[str]) -> str:

@@ -81,7 +81,7 @@ def run_identity(config: TrainConfig) -> dict[str, Any]:
 
 
 def open_run(config: TrainConfig) -> RunFolder:
-    """Make or find the run's folder, write its configuration, and point `latest` at it.
+    """Make or find the run's folder and write its configuration.
 
     With `resume=false` what an earlier run of that name left is removed first. Raises InputError
     where a run of that name was started with other options and is to be resumed.
@@ -98,7 +98,6 @@ def open_run(config: TrainConfig) -> RunFolder:
     if not config.resume:
         _start_over(path)
     write_whole(saved, yaml.safe_dump(asdict(config), sort_keys=False).encode())
-    _point(path.parent / _LATEST, name)
     return RunFolder(path)
 
 
@@ -129,10 +128,12 @@ def _check_same(saved: Path, identity: dict[str, Any]) -> None:
         )
 
 
-def _point(link: Path, target: str) -> None:
+def point_latest(folder: RunFolder) -> None:
+    """Let `latest` mean this run: once its data are known to be usable."""
+    link = folder.path.with_name(_LATEST)
     temporary = link.with_name(f".latest.{os.getpid()}")
     temporary.unlink(missing_ok=True)
-    temporary.symlink_to(target)
+    temporary.symlink_to(folder.path.name)
     temporary.replace(link)
 
 

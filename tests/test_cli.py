@@ -56,7 +56,7 @@ def _error(arguments: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
         (["category=hydrant", "model.prediction=eps"], "known: epsilon, v_prediction, sample"),
         (
             ["category=hydrant", "model.image_size=96"],
-            "128 is no multiple of model.image_size=96",
+            "give prep.image_size=192",
         ),
         (["category=hydrant", "model.patch=7"], "no multiple of 56"),
         (["category=hydrant", "data=co3d"], "give data.root=FOLDER"),

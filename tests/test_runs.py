@@ -15,7 +15,7 @@ from extrap_train.config import (
 )
 from extrap_train.config import DatasetDepthConfig as Depth
 from extrap_train.errors import InputError
-from extrap_train.runs import open_run
+from extrap_train.runs import open_run, point_latest
 
 
 @pytest.fixture
@@ -33,7 +33,18 @@ def config(tmp_path: Path) -> TrainConfig:
 def test_the_same_options_find_the_same_folder(config: TrainConfig, tmp_path: Path) -> None:
     first = open_run(config)
     assert open_run(config) == first
-    assert (tmp_path / "train/hydrant/small/latest").resolve() == first.path.resolve()
+
+
+def test_latest_moves_only_when_told(config: TrainConfig, tmp_path: Path) -> None:
+    """A run whose data turn out to be unusable leaves the link at the last good one."""
+    latest = tmp_path / "train/hydrant/small/latest"
+    first = open_run(config)
+    assert not latest.exists()
+    point_latest(first)
+    second = open_run(replace(config, seed=1))
+    assert latest.resolve() == first.path.resolve()
+    point_latest(second)
+    assert latest.resolve() == second.path.resolve()
 
 
 def test_other_options_are_another_run(config: TrainConfig) -> None:

@@ -9,12 +9,14 @@ from extrap_train.config.commands import DataPrepConfig, TrainConfig
 from extrap_train.config.completion import CompletionConfig
 from extrap_train.config.data import Co3dConfig, PrepConfig
 from extrap_train.config.model import FAMILIES, ModelConfig, SamplerConfig
+from extrap_train.config.training import TrainerConfig
 from extrap_train.config.tree import dotted
 from extrap_train.errors import InputError
 
+_ACCELERATORS = ("auto", "cpu", "gpu", "cuda", "mps")
 _PRECISIONS = ("32-true", "bf16-mixed", "16-mixed", "bf16-true", "16-true", "64-true")
 
-_BOUNDS: dict[str, tuple[float, float]] = {
+BOUNDS: dict[str, tuple[float, float]] = {
     "seed": (0, 2**30),
     "threads": (1, math.inf),
     "workers": (1, math.inf),
@@ -36,7 +38,17 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "launcher.memory_gib": (0.5, 4096),
     "launcher.hours": (0.02, 10_000),
     "prep.image_size": (1, 4096),
+    "prep.min_pair_angle_deg": (0, 90),
+    "prep.max_pair_angle_deg": (0, 90),
+    "prep.min_viewpoint_quality": (-1e3, 1e3),
+    "prep.min_point_cloud_quality": (-1e3, 1e3),
+    "prep.max_gap_deg": (0, 360),
+    "prep.min_coverage_deg": (0, 360),
+    "prep.near_duplicate_deg": (0, 180),
     "model.image_size": (8, 4096),
+    "model.warp_scale": (1, 8),
+    "model.learning_rate": (1e-9, 1),
+    "model.weight_decay": (0, 1),
     "prep.correction_grid": (4, 64),
     "prep.max_uses": (1, math.inf),
     "model.patch": (1, 64),
@@ -56,6 +68,7 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "minutes": (0.001, 10_000),
     "orbit": (1, 360),
     "frames": (1, 10_000),
+    "lora.learning_rate": (1e-9, 1),
     "lora.rank": (1, 1024),
     "lora.batch_size": (1, math.inf),
     "lora.steps": (1, math.inf),
@@ -63,6 +76,8 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "lora.patience": (1, math.inf),
     "sampler.steps": (1, 1000),
     "sampler.eta": (0, 1),
+    "sampler.guidance": (0, 100),
+    "sampler.guidance_far": (0, 100),
     "sampler.guidance_far_deg": (1, 180),
     "sampler.guidance_rescale": (0, 1),
     "complete.step_deg": (1, 180),
@@ -80,7 +95,7 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "trainer.full_rate_steps": (1, math.inf),
     "trainer.condition_dropout": (0, 1),
     "trainer.min_snr": (0.01, 1e6),
-    "trainer.ema_decay": (0, 1),
+    "trainer.ema_decay": (0, 0.999999),
     "trainer.devices": (1, math.inf),
     "trainer.checkpoint_every": (1, math.inf),
     "trainer.validate_every": (1, math.inf),
@@ -104,6 +119,8 @@ def validate(config: TrainConfig | DataPrepConfig, tasks: tuple[str, ...]) -> No
     if isinstance(config, TrainConfig):
         _check_one_of("task", config.task, tasks)
         _check_one_of("trainer.precision", config.trainer.precision, _PRECISIONS)
+        _check_one_of("trainer.accelerator", config.trainer.accelerator, _ACCELERATORS)
+        _check_intervals(config.trainer)
         _check_model(config.model, config.prep)
         _check_completion(config.complete)
         _check_sampler(config.sampler)
@@ -130,7 +147,7 @@ def required_file(path: str | None, option: str, content: str) -> str:
 
 def _check_bounds(config: TrainConfig | DataPrepConfig) -> None:
     for name, value in dotted(asdict(config)).items():
-        least, greatest = _BOUNDS.get(name, (-math.inf, math.inf))
+        least, greatest = BOUNDS.get(name, (-math.inf, math.inf))
         if not isinstance(value, int | float) or least <= value <= greatest:
             continue
         if greatest == math.inf:
@@ -155,10 +172,11 @@ def _check_model(model: ModelConfig, prep: PrepConfig) -> None:
             f"model.residual=true needs the fused warp, which model.family={model.family} is not "
             "told: give model.residual=false"
         )
-    if prep.image_size % model.image_size:
+    if prep.image_size != model.warp_size:
         raise InputError(
-            f"prep.image_size={prep.image_size} is no multiple of "
-            f"model.image_size={model.image_size}: give twice the latter, or the same"
+            f"prep.image_size={prep.image_size}, but warps are made at model.warp_scale="
+            f"{model.warp_scale} times model.image_size={model.image_size}: give "
+            f"prep.image_size={model.warp_size}"
         )
     groups = model.unet.norm_groups
     odd = [width for width in model.unet.channels if width <= 0 or width % groups]
@@ -177,6 +195,15 @@ def _check_model(model: ModelConfig, prep: PrepConfig) -> None:
         raise InputError(
             "model.prediction=epsilon says nothing at zero terminal SNR: "
             "give model.zero_terminal_snr=false"
+        )
+
+
+def _check_intervals(trainer: TrainerConfig) -> None:
+    """Validation looks at the averaged weights of a checkpoint."""
+    if trainer.validate_every % trainer.checkpoint_every:
+        raise InputError(
+            f"trainer.validate_every={trainer.validate_every} is no multiple of "
+            f"trainer.checkpoint_every={trainer.checkpoint_every}: give one that is"
         )
 
 

@@ -33,11 +33,13 @@ class SyntheticConfig(DataConfig):
     test_sequences: int = 5
     """Sequences 0 … n-1 are for testing, whatever else is asked for."""
     train_sequences: int = 40
+    """The sequences behind those."""
     frames: int = 24
     """Photographs around each scene."""
     image_size: int = 128
     """Pixels of the square photographs."""
     seed: int = 0
+    """Of shapes, materials, light and the walks around them."""
 
 
 @dataclass
@@ -54,18 +56,22 @@ class PrepConfig:
     """Which sequences and pairs become training data (paper III-A.1)."""
 
     image_size: int = 128
-    """Side of the stored square frames, in pixels: the size that warps are made at. A multiple of
-    the model's, which they are reduced to; twice as fine, thin surfaces survive the warp."""
+    """Side of the stored square frames, in pixels: the size that warps are made at, which is
+    `model.warp_scale` times `model.image_size`."""
     max_gap_deg: float = 30.0
     """Largest azimuth gap between neighbouring cameras of a 360° sequence."""
     min_coverage_deg: float = 300.0
     """Least azimuth covered around the fitted orbit axis."""
     min_viewpoint_quality: float = 0.0
+    """CO3D's own score of a frame's camera, where it has one."""
     min_point_cloud_quality: float = -2.0
+    """CO3D's own score of a sequence's cloud, where it has one."""
     max_uses: int = 16
     """Most pairs that one frame takes part in."""
     min_pair_angle_deg: float = 8.0
+    """Least angle between the views of a pair, seen from the scene's centre."""
     max_pair_angle_deg: float = 88.0
+    """Greatest angle between the views of a pair."""
     near_duplicate_deg: float = 6.0
     """A pair is skipped if a chosen one has both its frames within this angle of its own."""
     full_circle: str = "prefer"

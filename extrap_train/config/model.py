@@ -13,9 +13,12 @@ class UNetConfig:
     """Shape of the denoiser (diffusers' `UNet2DConditionModel`)."""
 
     channels: list[int] = field(default_factory=lambda: [32, 64, 128, 192])
+    """Width of each level, finest first."""
     layers_per_block: int = 1
     attention_levels: list[bool] = field(default_factory=lambda: [False, False, False, True])
+    """Which levels attend, finest first."""
     heads: int = 4
+    """Of each attention."""
     token_width: int = 192
     """Width of the one cross-attention token."""
     norm_groups: int = 16
@@ -50,6 +53,9 @@ class ModelConfig:
     warp, `ours` the fused warp, its positional encoding and its mask, too.
     """
     image_size: int = 64
+    """Side of the square views that it paints, in pixels."""
+    warp_scale: int = 2
+    """Side of the warp over `image_size`: made finer and then reduced, thin surfaces survive it."""
     vae: VaeConfig | None = None
     """Autoencoder of the latents; null takes patches of pixels."""
     patch: int = 2
@@ -67,17 +73,25 @@ class ModelConfig:
     residual: bool = True
     """Denoise the difference to the hole-filled warp instead of the image itself; `ours` only."""
     prediction: str = "sample"
-    """`epsilon`, `v_prediction` or `sample`."""
+    """What the denoiser says: `epsilon` (the noise), `v_prediction` or `sample` (the latent)."""
     zero_terminal_snr: bool = True
+    """The noisiest step is pure noise, as sampling starts from (Lin et al. 2023)."""
     unet: UNetConfig = field(default_factory=UNetConfig)
     learning_rate: float = 3e-4
+    """Of AdamW, after the warm-up."""
     projection_rate: float = 1.0
     """Learning rate of the token's projection, as a multiple of `learning_rate`."""
     weight_decay: float = 0.01
+    """Of AdamW."""
     start: str | None = None
     """What training starts from: a model folder, a published checkpoint (ZeroNVS's .ckpt,
     MegaScenes's iter_N folder, a diffusers folder), or `base`, the packaged model; null is random.
     """
+
+    @property
+    def warp_size(self) -> int:
+        """Side of the references and of the warp between them, in pixels."""
+        return self.warp_scale * self.image_size
 
 
 @dataclass
@@ -87,6 +101,7 @@ class SamplerConfig:
     solver: str = "ddim"
     """`ddim` (paper), or of second order, for few steps: `dpmpp` (DPM-Solver++ 2M), `unipc`."""
     steps: int = 2
+    """Evaluations of the denoiser."""
     eta: float = 0.0
     """Share of DDIM's noise that is drawn anew at every step; 0 is deterministic."""
     guidance: float = 1.0

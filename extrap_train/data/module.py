@@ -24,6 +24,8 @@ def with_warp(batch: PairBatch, image_size: int | None = None) -> PairBatch:
     that size is a multiple. None keeps it.
     """
     if batch.warp is not None:
+        if image_size not in (None, batch.camera.height):
+            raise ValueError(f"the warp is there already, at {batch.camera.height} pixels")
         return batch
     warp = warp_references(
         batch.reference_images,

@@ -13,7 +13,6 @@ from extrap_train.data.module import with_warp
 from extrap_train.data.queries import query_batch
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sample_views, view_generator
-from extrap_train.geometry.reduction import WARP_SCALE
 from extrap_train.views import Camera, View, Warp, combine
 
 
@@ -66,6 +65,11 @@ class DiffusionGenerator:
         """See `ViewGenerator.image_size`."""
         return self.model.config.image_size
 
+    @property
+    def warp_size(self) -> int:
+        """Side of the square views that it warps from, in pixels."""
+        return self.model.config.warp_size
+
     def generate(
         self, references: Sequence[View], queries: Camera, names: Sequence[str], seed: int = 0
     ) -> GeneratedViews:
@@ -84,7 +88,7 @@ class DiffusionGenerator:
         self, references: Sequence[View], queries: Camera, names: Sequence[str], seed: int
     ) -> GeneratedViews:
         config = self.model.config
-        size = WARP_SCALE * config.image_size
+        size = config.warp_size
         device = next(self.model.parameters()).device
         # Geometry keeps its precision where the caller lets the network run in less.
         with torch.autocast(device.type, enabled=False):

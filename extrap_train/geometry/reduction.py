@@ -13,7 +13,7 @@ from torch.nn import functional
 from extrap_train.views import PairBatch, Warp
 
 WARP_SCALE = 2
-"""Side of the warp over the model's where nothing else says it (`PrepConfig.image_size` does)."""
+"""Side of the warp over that of what is made from it, where no model says it."""
 
 
 def reduced_batch(batch: PairBatch, factor: int) -> PairBatch:

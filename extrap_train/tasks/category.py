@@ -31,7 +31,7 @@ from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.errors import InputError
 from extrap_train.metrics import Distance, lpips_or_reason
-from extrap_train.runs import RunFolder, open_run, provenance
+from extrap_train.runs import RunFolder, open_run, point_latest, provenance
 from extrap_train.tasks.prepare import prepare_category
 from extrap_train.tasks.results import Results, draw_views, is_finished, write_results
 
@@ -48,6 +48,7 @@ def run(config: TrainConfig) -> None:
     try:
         with FileLock(folder.path / ".lock", timeout=0):
             if config.resume and is_finished(folder, config):
+                point_latest(folder)
                 console.print(f"already trained for {config.trainer.steps} steps: {folder.path}")
                 return
             _train(config, folder, model, distance, missing, console)
@@ -67,6 +68,7 @@ def _train(
 ) -> None:
     started = time.perf_counter()
     prepared = _prepared(config)
+    point_latest(folder)
     seconds = {"prepare": time.perf_counter() - started}
     data = _data_module(config, prepared)
     training = CategoryTraining(model, config, _names(data), distance)

@@ -40,7 +40,7 @@ from extrap_train.reconstruction.planner import Query, expected_order, orbit_que
 from extrap_train.reconstruction.pose_check import check_poses
 from extrap_train.reconstruction.viewer import CloudViewer
 from extrap_train.tasks.completed import Completed, write_completed
-from extrap_train.tasks.scene_inputs import trained_model
+from extrap_train.tasks.scene_inputs import required_scene, trained_model
 from extrap_train.views import stack_cameras, stack_poses
 
 _NOT_PART_OF_THE_MAP = ("dry_run", "viewer", "port", "held_out")
@@ -73,12 +73,11 @@ def run(config: TrainConfig) -> None:
 
 
 def _job(config: TrainConfig) -> _Job:
-    if config.scene is None:
-        raise InputError("task=complete needs a scene: give scene=FOLDER or synthetic:hydrant/0003")
+    scene = required_scene(config)
     options = config.data if isinstance(config.data, SyntheticConfig) else SyntheticConfig()
-    sequence = open_scene(config.scene, options)
+    sequence = open_scene(scene, options)
     truth = None
-    if config.scene.startswith(SYNTHETIC_SCHEME):
+    if scene.startswith(SYNTHETIC_SCHEME):
         truth = build_scene(sequence.category, int(sequence.name), options.seed)
     elif config.complete.generator == "exact":
         raise InputError("complete.generator=exact renders: it needs scene=synthetic:…")

@@ -42,7 +42,7 @@ def run(config: TrainConfig) -> None:
     distance, missing = lpips_or_reason(config.validation.lpips_weights)
     fabric = fabric_of(config)
     model = trained_model(config).to(fabric.device)
-    inputs = open_inputs(config, model.config.image_size)
+    inputs = open_inputs(config, model.config.warp_size)
     pairs = ScenePairs(inputs.views, model.config.references)
     folder = Path(config.output) / "scene" / inputs.label
     asked = _asked(config, inputs)

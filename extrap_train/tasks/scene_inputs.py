@@ -16,7 +16,6 @@ from extrap_train.diffusion.checkpoint import load_model, packaged_weights
 from extrap_train.diffusion.lora import load_adapter
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError
-from extrap_train.geometry.reduction import WARP_SCALE
 from extrap_train.views import View
 
 
@@ -38,14 +37,23 @@ class SceneInputs:
         return f"{sequence.category}-{sequence.name}"
 
 
-def open_inputs(config: TrainConfig, image_size: int) -> SceneInputs:
-    """The scene's input views for a model of this size; depth comes from these views alone."""
+def required_scene(config: TrainConfig) -> str:
+    """The scene's address; raises InputError where none is given."""
     if config.scene is None:
-        raise InputError(f"task={config.task} needs a scene: give scene=PATH (see --help)")
+        raise InputError(
+            f"task={config.task} needs a scene: give scene=FOLDER, "
+            "scene=co3d:ROOT/category/sequence or scene=synthetic:category/0003"
+        )
+    return config.scene
+
+
+def open_inputs(config: TrainConfig, image_size: int) -> SceneInputs:
+    """The scene's input views at this size; depth comes from these views alone."""
+    scene = required_scene(config)
     synthetic = config.data if isinstance(config.data, SyntheticConfig) else None
-    sequence = open_scene(config.scene, synthetic)
+    sequence = open_scene(scene, synthetic)
     chosen = choose_frames(sequence, config.input_frames, config.inputs)
-    views = input_views(sequence, chosen, depth_source(config.depth), WARP_SCALE * image_size)
+    views = input_views(sequence, chosen, depth_source(config.depth), image_size)
     others = [frame for i, frame in enumerate(sequence.frames) if i not in chosen]
     return SceneInputs(sequence, views, others)
 

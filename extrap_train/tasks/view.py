@@ -17,10 +17,9 @@ from extrap_train.config import DatasetDepthConfig, DepthConfig, SamplerConfig, 
 from extrap_train.data.posed import read_cameras
 from extrap_train.data.scene import open_scene
 from extrap_train.depth.build import depth_source
-from extrap_train.diffusion.generator import DiffusionGenerator, GeneratedViews, ViewGenerator
+from extrap_train.diffusion.generator import DiffusionGenerator, GeneratedViews
 from extrap_train.errors import InputError
 from extrap_train.geometry.orbits import LEAST_VIEWS, orbit_cameras
-from extrap_train.geometry.reduction import WARP_SCALE
 from extrap_train.metrics import psnr, quantised
 from extrap_train.pictures import contact_sheet, film, mark_holes, picture
 from extrap_train.tasks.scene_inputs import (
@@ -28,6 +27,7 @@ from extrap_train.tasks.scene_inputs import (
     fabric_of,
     open_inputs,
     open_model,
+    required_scene,
     trained_model,
 )
 from extrap_train.views import Camera, View, stack_cameras
@@ -36,11 +36,12 @@ from extrap_train.views import Camera, View, stack_cameras
 def run(config: TrainConfig) -> None:
     """Paint the views that `pose` or `orbit` ask for, and leave them as PNG, GIF and MP4."""
     console = Console()
+    required_scene(config)
     if (config.pose is None) == (config.orbit is None):
         raise InputError("task=view needs a pose=FRAME|FILE.json or an orbit=DEGREES, one of both")
     fabric = fabric_of(config)
     model = trained_model(config).to(fabric.device)
-    inputs = open_inputs(config, model.config.image_size)
+    inputs = open_inputs(config, model.config.warp_size)
     names, cameras, truth = _queries(config, inputs, model.config.image_size)
     with fabric.autocast():
         generator = DiffusionGenerator(model, config.sampler)
@@ -63,7 +64,7 @@ def open_generator(
 
 def open_views(
     scene: str,
-    generator: ViewGenerator,
+    generator: DiffusionGenerator,
     inputs: int | None = None,
     depth: DepthConfig | None = None,
 ) -> list[View]:
@@ -74,7 +75,7 @@ def open_views(
     sequence = open_scene(scene)
     chosen = choose_frames(sequence, (), inputs)
     source = depth_source(depth or DatasetDepthConfig())
-    return input_views(sequence, chosen, source, WARP_SCALE * generator.image_size)
+    return input_views(sequence, chosen, source, generator.warp_size)
 
 
 def walk(views: Sequence[View], degrees: float, frames: int) -> tuple[Camera, list[str]]:

@@ -117,7 +117,7 @@ def test_what_cannot_be_used_is_one_line(command, weights, tmp_path) -> None:
     given = f"weights={weights}"
     one = ["task=scene", given, "inputs=1"]
     assert "has 1 input view, and pairs need at least two" in _refused(command, *one)
-    assert "give scene=PATH" in _refused(command, "task=scene", given, "scene=null")
+    assert "give scene=FOLDER" in _refused(command, "task=scene", given, "scene=null")
     assert "there is no trained model of hydrant" in _refused(command, "task=scene")
     assert "neither a model folder nor `base`" in _refused(command, "task=scene", "weights=bse")
     view = ["task=view", given]
