@@ -18,6 +18,8 @@ from data_prep.split import Split, split_sequences
 from data_prep.tables import Outcome, write_results
 from data_prep.unit import NO_SPACE, Unit, Workshop, prepare_unit
 from extrap_train.config import PrepConfig
+from extrap_train.data.files import remove_partial
+from extrap_train.data.frame_files import sequence_folder
 from extrap_train.data.sequences import Sequence
 from extrap_train.data.store import FORMAT, PreparedData, read_manifest
 from extrap_train.depth import DepthSource
@@ -87,12 +89,21 @@ def prepare(
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "manifest.json").unlink(missing_ok=True)
         outcomes, split = _make_all(plan, launcher, progress)
+        _remove_partial(shop, sequences)
         write_results(shop, outcomes, split, key)
     except OSError as error:
         if error.errno not in NO_SPACE:
             raise
         raise InputError(_disk_full(folder, sequences, options)) from None
     return PreparedData.open(folder)
+
+
+def _remove_partial(shop: Workshop, sequences: ListOf[Sequence]) -> None:
+    """What killed runs have left half-written; all units are done, so nobody writes there now."""
+    remove_partial(shop.folder)
+    for category in {sequence.category for sequence in sequences}:
+        for root, kind in ((shop.frames, "frames"), (shop.folder, "pairs")):
+            remove_partial(sequence_folder(root, kind, category))
 
 
 def _is_finished(folder: Path, key: str, retry: bool) -> bool:

@@ -4,6 +4,7 @@ import gzip
 import json
 import os
 import re
+import shutil
 import zlib
 from pathlib import Path
 from typing import Any
@@ -107,3 +108,15 @@ def write_whole(path: Path, content: bytes) -> None:
         raise InputError(
             f"{path}: cannot be written ({error.strerror}); free space or choose another folder"
         ) from None
+
+
+def remove_partial(folder: Path) -> None:
+    """Remove the `.*.tmp` that killed writers have left in a folder, which need not exist.
+
+    Whoever calls this must know that nobody is writing there.
+    """
+    for path in folder.glob(".*.tmp"):
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink()

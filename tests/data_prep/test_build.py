@@ -95,6 +95,16 @@ def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert fresh.manifest["pairs"] == data.manifest["pairs"]
 
 
+def test_what_a_killed_run_has_half_written_is_removed(tmp_path: Path) -> None:
+    for kind in ("frames", "pairs"):
+        half = tmp_path / "cup" / kind / "cup" / ".0001.x7.tmp"
+        half.mkdir(parents=True)
+        (half / "images.npy").write_bytes(b"half of it")
+    (tmp_path / "cup" / ".manifest.json.77.tmp").write_bytes(b"{")
+    run(tmp_path / "cup", captures(3))
+    assert not list((tmp_path / "cup").rglob("*.tmp"))
+
+
 def test_two_runs_give_the_same_files(tmp_path: Path) -> None:
     for name in ("one", "two"):
         run(tmp_path / name, captures(3))

@@ -1,0 +1,75 @@
+"""Photographs and depth maps that are damaged or gone: reported, and the rest is prepared."""
+
+import logging
+import shutil
+from pathlib import Path
+
+import pytest
+from captures import write_capture
+
+from extrap_train.config import Co3dConfig, DatasetDepthConfig, FlowMatcherConfig, PrepConfig
+from extrap_train.data.store import PreparedData
+from extrap_train.tasks.prepare import prepare_category
+
+NAMES = ("fine", "no_depth", "one_corrupt", "two_corrupt", "also_fine")
+FRAMES = 12
+
+
+@pytest.fixture
+def photographs(tmp_path: Path) -> Path:
+    write_capture(tmp_path / "co3d", NAMES, FRAMES)
+    return tmp_path / "co3d"
+
+
+def prepared(photographs: Path) -> PreparedData:
+    return prepare_category(
+        "cup",
+        Co3dConfig(root=str(photographs), test_sequences=1),
+        DatasetDepthConfig(),
+        PrepConfig(image_size=16, correct=False),
+        output=photographs.parent / "outputs",
+        workers=1,
+        matcher=FlowMatcherConfig(),
+        retry=True,
+    )
+
+
+def cut_short(photographs: Path, sequence: str, frame: int) -> Path:
+    """Half of a photograph, as a broken download leaves it."""
+    file = sorted((photographs / "cup" / sequence / "images").iterdir())[frame]
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    return file
+
+
+def test_damaged_sequences_are_reported_and_the_rest_goes_on(
+    photographs: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    shutil.rmtree(photographs / "cup" / "no_depth" / "depths")
+    corrupt = cut_short(photographs, "one_corrupt", 5)
+    first_of_two = cut_short(photographs, "two_corrupt", 5)
+    cut_short(photographs, "two_corrupt", 6)
+    with caplog.at_level(logging.WARNING):
+        data = prepared(photographs)
+    assert data.manifest["sequences"] == {"kept": 3, "dropped": 0, "failed": 2}
+    reasons = data.sequences.set_index("sequence")["reason"]
+    assert "12 of 12 frames cannot be used" in reasons["cup/no_depth"]
+    assert "geometric.png: no such file" in reasons["cup/no_depth"]
+    assert "2 of 12 frames cannot be used" in reasons["cup/two_corrupt"]
+    assert f"{first_of_two}: is truncated or damaged" in reasons["cup/two_corrupt"]
+    assert reasons["cup/no_depth"] in caplog.text
+    # One in twelve is no reason to give a sequence up.
+    assert corrupt.name not in data.names("cup/one_corrupt")
+    assert len(data.names("cup/one_corrupt")) == FRAMES - 1
+    assert f"1 frames left out: {corrupt}" in caplog.text
+
+
+def test_a_restored_sequence_is_taken_in_and_nothing_else_redone(photographs: Path) -> None:
+    depths = photographs / "cup" / "no_depth" / "depths"
+    depths.rename(photographs / "elsewhere")
+    first = prepared(photographs)
+    files = {f: f.stat().st_mtime_ns for f in first.folder.glob("pairs/cup/*/pairs.parquet")}
+    (photographs / "elsewhere").rename(depths)
+    second = prepared(photographs)
+    assert len(files) == len(NAMES) - 1
+    assert second.manifest["sequences"] == {"kept": len(NAMES), "dropped": 0, "failed": 0}
+    assert {file: file.stat().st_mtime_ns for file in files} == files
