@@ -68,9 +68,16 @@ class Diffusion:
         except InputError:
             raise Unavailable(
                 f"no weights: {name} is neither a model folder nor in the package; train them with "
-                f"`python -m extrap_train category={category} …` and give the run's model/ folder "
-                "as options.METHOD.weights="
+                f"`{self._recipe(category)}` and give the run's model/ folder as "
+                f"options.METHOD.weights=FOLDER"
             ) from None
+
+    def _recipe(self, category: str) -> str:
+        """The command that makes the missing weights at the small size."""
+        chosen = (
+            f"category={category}" if self.family == "ours" else f"experiment=small_{self.family}"
+        )
+        return f"python -m extrap_train {chosen}"
 
 
 @lru_cache(2)

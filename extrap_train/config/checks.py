@@ -167,10 +167,10 @@ def _check_prep(prep: PrepConfig) -> None:
 def _check_model(model: ModelConfig, prep: PrepConfig) -> None:
     _check_one_of("model.prediction", model.prediction, ("epsilon", "v_prediction", "sample"))
     _check_one_of("model.family", model.family, FAMILIES)
-    if model.residual and model.family != "ours":
+    if model.residual and model.family == "zeronvs":
         raise InputError(
-            f"model.residual=true needs the fused warp, which model.family={model.family} is not "
-            "told: give model.residual=false"
+            "model.residual=true needs a warp, which model.family=zeronvs is not told: give "
+            "model.residual=false"
         )
     if prep.image_size != model.warp_size:
         raise InputError(

@@ -71,7 +71,9 @@ class ModelConfig:
     input channels, which the packaged base lacks: give model.start=null.
     """
     residual: bool = True
-    """Denoise the difference to the hole-filled warp instead of the image itself; `ours` only."""
+    """Denoise the difference to the hole-filled warp instead of the image itself: to the fused one,
+    or for `megascenes` to the nearest reference's. `zeronvs` is told no warp.
+    """
     prediction: str = "sample"
     """What the denoiser says: `epsilon` (the noise), `v_prediction` or `sample` (the latent)."""
     zero_terminal_snr: bool = True
@@ -86,6 +88,7 @@ class ModelConfig:
     start: str | None = None
     """What training starts from: a model folder, a published checkpoint (ZeroNVS's .ckpt,
     MegaScenes's iter_N folder, a diffusers folder), or `base`, the packaged model; null is random.
+    Weights of another family are taken over where they mean the same (`diffusion.transfer`).
     """
 
     @property

@@ -1,25 +1,31 @@
 """A model on disk: a diffusers folder with safetensors, and back; what training starts from."""
 
+import hashlib
 import json
 import os
 import shutil
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import Tensor, nn
+from torch import Tensor
 
 from extrap_train.config import ClipConfig, ModelConfig, UNetConfig, VaeConfig
 from extrap_train.data.files import write_whole
+from extrap_train.diffusion.autoencoder import PixelPatches
+from extrap_train.diffusion.compact import compress, restore
 from extrap_train.diffusion.model import ExtrapolationModel
-from extrap_train.diffusion.published.read import SOURCES, read_published, weights_at
+from extrap_train.diffusion.published.read import SOURCES, Shapes, read_published, weights_at
+from extrap_train.diffusion.transfer import narrowed, turned_pose, widened
 from extrap_train.errors import InputError
 from extrap_train.weight_files import WeightFile
 
 _CONFIG = "extrapolation_model.json"
 _PUBLISHED_CHANNELS = {8: "zeronvs", 11: "megascenes"}
+_COMPACT = "difference.safetensors"
 _DIFFUSERS_NAME = "diffusion_pytorch_model.safetensors"
 _FILES = {
     "unet": _DIFFUSERS_NAME,
@@ -49,12 +55,12 @@ def save_model(model: ExtrapolationModel, folder: Path, dtype: torch.dtype = tor
     temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
     shutil.rmtree(temporary, ignore_errors=True)
     try:
-        write_whole(
-            temporary / _CONFIG, (json.dumps(asdict(model.config), indent=1) + "\n").encode()
-        )
+        _write_config(model, temporary)
         for part, network in model.parts().items():
             (temporary / part).mkdir()
-            _write_weights(network, temporary / part / _FILES[part], dtype)
+            state = network.state_dict()  # copied: a module that goes on training keeps its own
+            halved = {k: v.detach().to("cpu", dtype).contiguous() for k, v in state.items()}
+            _save(halved, temporary / part / _FILES[part])
         model.unet.save_config(temporary / "unet")
         model.schedule.save_pretrained(temporary / "scheduler")
         if model.config.vae is not None:
@@ -68,12 +74,72 @@ def save_model(model: ExtrapolationModel, folder: Path, dtype: torch.dtype = tor
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _write_weights(network: nn.Module, path: Path, dtype: torch.dtype) -> None:
-    """A copy, so that the module that goes on training keeps its precision."""
-    tensors = network.state_dict()
-    state = {k: v.detach().to("cpu", dtype).contiguous() for k, v in tensors.items()}
+def save_compact(model: ExtrapolationModel, folder: Path, base: str = "base") -> None:
+    """Write the model as its difference to a packaged one (`compact`); lossy, for packages.
+
+    The folder appears complete or not at all; an older one of that name is replaced.
+    """
+    start = packaged_weights(base)
+    tensors = compress(_state(model), _state(load_model(start)))
+    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
+    shutil.rmtree(temporary, ignore_errors=True)
     try:
-        save_file(state, path, metadata={"format": "pt"})
+        _write_config(model, temporary)
+        _save(tensors, temporary / _COMPACT, {"base": base, "base_sha256": _digest(start)})
+        shutil.rmtree(folder, ignore_errors=True)
+        temporary.replace(folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def is_compact(folder: Path) -> bool:
+    """Whether the folder is one that `save_compact` wrote."""
+    return (folder / _COMPACT).is_file()
+
+
+def _read_compact(
+    folder: Path, wanted: Mapping[str, Shapes], config: ModelConfig
+) -> dict[str, tuple[WeightFile, dict[str, Tensor]]]:
+    """Each part's tensors, as `read_published` gives them."""
+    file = WeightFile(folder / _COMPACT, "weights", "a model that task=pack wrote")
+    tensors = file.tensors(file.read())
+    with safe_open(file.path, framework="pt") as opened:
+        about = opened.metadata() or {}
+    base = packaged_weights(about.get("base", ""))
+    if about.get("base_sha256") != _digest(base):
+        raise file.refusal(f"is a difference to another {base.name} than the package holds")
+    shapes = {f"{part}.{name}": s for part, inner in wanted.items() for name, s in inner.items()}
+    try:
+        whole = restore(tensors, _state(load_model(base)), shapes)
+    except ValueError as error:
+        raise file.refusal(f"is damaged ({error})") from None
+    return {
+        part: (file, {name: whole[key] for name in inner if (key := f"{part}.{name}") in whole})
+        for part, inner in wanted.items()
+    }
+
+
+def _state(model: ExtrapolationModel) -> dict[str, Tensor]:
+    return {
+        f"{part}.{name}": x
+        for part, network in model.parts().items()
+        for name, x in network.state_dict().items()
+    }
+
+
+def _digest(folder: Path) -> str:
+    """Of all weights in a model's folder."""
+    files = sorted(folder.rglob("*.safetensors"))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
+
+
+def _write_config(model: ExtrapolationModel, folder: Path) -> None:
+    write_whole(folder / _CONFIG, (json.dumps(asdict(model.config), indent=1) + "\n").encode())
+
+
+def _save(tensors: dict[str, Tensor], path: Path, about: Mapping[str, str] | None = None) -> None:
+    try:
+        save_file(tensors, path, metadata={"format": "pt", **(about or {})})
     except (OSError, SafetensorError) as error:
         raise InputError(
             f"{path}: cannot be written ({error}); free space or choose another folder"
@@ -104,18 +170,19 @@ def _saved_config(folder: Path) -> ModelConfig:
 def load_weights(model: ExtrapolationModel, path: Path) -> None:
     """Fill a model with the weights of a folder or of a published checkpoint.
 
-    Names and shapes must be the same, but for a denoiser of the `zeronvs` family that another
-    family starts from: its new input channels start at zero, which leaves its output as it was.
+    Names and shapes must be the same, but where one family starts from another (`transfer`).
     """
     networks = model.parts()
     wanted = {
         part: {name: x.shape for name, x in network.state_dict().items()}
         for part, network in networks.items()
     }
-    found = read_published(path, wanted, model.config)
+    read = _read_compact if is_compact(path) else read_published
+    found = read(path, wanted, model.config)
     file, unet = found["unet"]
     family = _family(path, file, unet["conv_in.weight"])
-    unet["conv_in.weight"] = _widened(file, unet["conv_in.weight"], family, model)
+    if family != model.config.family:
+        _take_over(found, family, model)
     for part, (part_file, tensors) in found.items():
         part_file.fill(networks[part], tensors)
 
@@ -131,19 +198,26 @@ def _family(path: Path, file: WeightFile, conv_in: Tensor) -> str:
     return _PUBLISHED_CHANNELS[channels]
 
 
-def _widened(file: WeightFile, weight: Tensor, family: str, model: ExtrapolationModel) -> Tensor:
-    """First layer with zeros for the channels that the published denoiser was not told."""
-    wanted = model.unet.conv_in.weight.shape
-    if family == model.config.family:
-        return weight
-    if family != "zeronvs" or weight.shape[1] > wanted[1]:
+def _take_over(
+    found: dict[str, tuple[WeightFile, dict[str, Tensor]]], family: str, model: ExtrapolationModel
+) -> None:
+    """Fit the tensors of a denoiser of `family` to the model's own, in place."""
+    (file, unet), (_, projection) = found["unet"], found["cc_projection"]
+    weight, own = unet["conv_in.weight"], model.config.family
+    channels = model.unet.conv_in.weight.shape[1]
+    grows = weight.shape[1] <= channels
+    if family == "ours" and isinstance(model.autoencoder, PixelPatches):
+        unet["conv_in.weight"] = narrowed(weight, model.autoencoder, own)
+        if own == "megascenes":
+            projection["weight"] = turned_pose(projection["weight"])
+    elif family == "zeronvs" and grows:
+        unet["conv_in.weight"] = widened(weight, channels)
+    else:
         raise file.refusal(
-            f"is of the family {family} ({weight.shape[1]} input channels), but model.family="
-            f"{model.config.family} takes {wanted[1]}: only zeronvs can be widened to another; "
-            f"choose model.family={family}"
+            f"is of the family {family} ({weight.shape[1]} input channels), but model.family={own} "
+            f"takes {channels}: only zeronvs can be widened to another, and only a small `ours` "
+            f"narrowed; choose model.family={family}"
         )
-    zeros = weight.new_zeros(len(weight), wanted[1] - weight.shape[1], *weight.shape[2:])
-    return torch.cat([weight, zeros], 1)
 
 
 def initial_model(config: ModelConfig) -> ExtrapolationModel:
@@ -160,6 +234,7 @@ def initial_model(config: ModelConfig) -> ExtrapolationModel:
         return ExtrapolationModel(config)
     with torch.device("meta"):
         model = ExtrapolationModel(config)
-    path = weights_at(Path(config.start))
+    given = Path(config.start)
+    path = given if is_compact(given) else weights_at(given)
     load_weights(model, packaged_weights(config.start) if path is None else path)
     return model

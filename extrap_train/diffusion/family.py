@@ -23,12 +23,13 @@ from extrap_train.diffusion.conditioning import (
     Null,
     concatenated_latents,
     condition_channels,
+    filled_warp,
     geometry_channels,
 )
 from extrap_train.diffusion.pose_encoding import depth_scale, megascenes_pose, zeronvs_pose
 from extrap_train.geometry.resample import lanczos_resize
 from extrap_train.geometry.warp import warp_references
-from extrap_train.views import PairBatch
+from extrap_train.views import PairBatch, Warp
 
 
 @runtime_checkable
@@ -78,7 +79,11 @@ class ZeroNvs:
 
 
 class MegaScenes:
-    """Pose and the nearest reference's warp (Tung et al. 2024), black in its holes."""
+    """Pose and the nearest reference's warp (Tung et al. 2024), black in its holes.
+
+    With `residual` the denoised latent is relative to that warp, its holes filled; the published
+    model has `residual: false`.
+    """
 
     def channels(self, latent_channels: int, config: ModelConfig) -> int:
         """See `Family.channels`."""
@@ -89,16 +94,12 @@ class MegaScenes:
     ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b z h w"]]:
         """See `Family.latents`; the warp is not encoded but shrunk to the latents' size."""
         reference = autoencoder.encode_reference(batch.reference_images[:, 0])
-        height, width = reference.shape[-2:]
-        warp = warp_references(
-            batch.reference_images[:, :1],
-            batch.reference_depths[:, :1],
-            batch.reference_cameras[:, :1],
-            batch.reference_valid[:, :1],
-            batch.camera,
-        )
-        shrunk = lanczos_resize(warp.image, height, width).clamp(0, 1) * 2 - 1
-        return torch.cat([reference, shrunk], 1), torch.zeros_like(reference)
+        warp = _nearest_warp(batch)
+        shrunk = lanczos_resize(warp.image, *reference.shape[-2:]).clamp(0, 1) * 2 - 1
+        base = torch.zeros_like(reference)
+        if config.residual:
+            base = autoencoder.encode(filled_warp(warp))
+        return torch.cat([reference, shrunk], 1), base
 
     def pose(self, batch: PairBatch) -> Float[Tensor, "b 19"]:
         """See `Family.pose`."""
@@ -138,6 +139,19 @@ class Ours:
     def null(self, latent_channels: int, embedding_width: int) -> Null:
         """See `Family.null`."""
         return Null()
+
+
+def _nearest_warp(batch: PairBatch) -> Warp:
+    """Of the nearest reference alone: the batch's own, at its finer size, where it has no other."""
+    if batch.warp is not None and batch.reference_images.shape[1] == 1:
+        return batch.warp
+    return warp_references(
+        batch.reference_images[:, :1],
+        batch.reference_depths[:, :1],
+        batch.reference_cameras[:, :1],
+        batch.reference_valid[:, :1],
+        batch.camera,
+    )
 
 
 FAMILIES: dict[str, Family] = {"zeronvs": ZeroNvs(), "megascenes": MegaScenes(), "ours": Ours()}

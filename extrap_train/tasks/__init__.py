@@ -6,6 +6,7 @@ from typing import Any
 TASKS = (
     "category",
     "complete",
+    "pack",
     "scene",
     "view",
 )

@@ -7,6 +7,7 @@ import torch
 
 from extrap_train.config import ModelConfig, SamplerConfig
 from extrap_train.data.module import with_warp
+from extrap_train.diffusion.conditioning import filled_warp
 from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sample_views, view_generator
@@ -99,3 +100,25 @@ def test_views_of_another_size_are_refused(config: ModelConfig, batch: PairBatch
     model = _model(replace(config, image_size=64), "ours")
     with pytest.raises(InputError, match=r"views of 32 x 32 pixels.*trained on 64 x 64: resize"):
         model.condition(batch)
+
+
+def test_a_residual_megascenes_denoises_the_difference_to_its_own_warp(
+    config: ModelConfig, batch: PairBatch
+) -> None:
+    """One reference: the batch's warp is that of the nearest, and no other is made."""
+    alone = replace(
+        batch,
+        reference_images=batch.reference_images[:, :1],
+        reference_depths=batch.reference_depths[:, :1],
+        reference_cameras=batch.reference_cameras[:, :1],
+        reference_valid=batch.reference_valid[:, :1],
+        warp=None,
+    )
+    told = with_warp(alone)
+    assert told.warp is not None
+    model = ExtrapolationModel(replace(config, family="megascenes", residual=True))
+    condition = model.condition(told)
+    torch.testing.assert_close(model.autoencoder.decode(condition.base), filled_warp(told.warp))
+    among_others = model.condition(batch)
+    torch.testing.assert_close(among_others.base, condition.base)
+    torch.testing.assert_close(among_others.latents, condition.latents)
