@@ -39,6 +39,11 @@ class ViewGenerator(Protocol):
         """Side of the square pictures, in pixels."""
         ...
 
+    @property
+    def warp_size(self) -> int:
+        """Side of the square views that it warps from, in pixels."""
+        ...
+
     def generate(
         self, references: Sequence[View], queries: Camera, names: Sequence[str], seed: int = 0
     ) -> GeneratedViews:
@@ -67,7 +72,7 @@ class DiffusionGenerator:
 
     @property
     def warp_size(self) -> int:
-        """Side of the square views that it warps from, in pixels."""
+        """See `ViewGenerator.warp_size`."""
         return self.model.config.warp_size
 
     def generate(

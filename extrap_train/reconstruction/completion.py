@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import torch
+from torch.nn import functional
 
 from extrap_train.config import CompletionConfig
 from extrap_train.depth import DepthSource
@@ -144,10 +145,16 @@ def _picture(
     generator: ViewGenerator,
     seed: int,
 ) -> View:
-    """The query's picture as an 8-bit file would keep it, so that a resumed run sees the same."""
+    """The query's picture at the map's size, as an 8-bit file would keep it, so that a resumed run
+    sees the same.
+    """
     views = [known.views[index].view for index in references]
     made = generator.generate(views, stack_cameras([query.camera]), [query.name], seed)
-    image = (made.images[0].clamp(0, 1) * 255).round() / 255
+    size = (query.camera.height, query.camera.width)
+    image = made.images
+    if image.shape[-2:] != size:
+        image = functional.interpolate(image, size, mode="bicubic")
+    image = (image[0].clamp(0, 1) * 255).round() / 255
     return View(image, query.camera, name=query.name)
 
 

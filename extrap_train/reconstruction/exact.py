@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from extrap_train.data.module import with_warp
 from extrap_train.data.queries import query_batch
@@ -24,18 +26,24 @@ class ExactGenerator:
     unit: WorldUnit
     """Of the map that views and queries belong to."""
 
+    @property
+    def warp_size(self) -> int:
+        """As large as the pictures."""
+        return self.image_size
+
     def generate(
         self, references: Sequence[View], queries: Camera, names: Sequence[str], seed: int = 0
     ) -> GeneratedViews:
         """The true pictures; the seed changes nothing."""
         batch, chosen = query_batch(references, queries, REFERENCES, self.image_size)
         batch = with_warp(batch)
-        count = len(queries.world_to_cam)
-        images = [
-            render(self.scene, self.unit.outside(batch.camera[i])).image for i in range(count)
-        ]
+        images = [self.photograph(batch.camera[i]) for i in range(len(queries.world_to_cam))]
         assert batch.warp is not None
         return GeneratedViews(torch.stack(images), batch.camera, batch.warp, chosen)
+
+    def photograph(self, camera: Camera) -> Float[Tensor, "3 h w"]:
+        """The picture that a camera in the map's world would take."""
+        return render(self.scene, self.unit.outside(camera)).image
 
 
 @dataclass(frozen=True)

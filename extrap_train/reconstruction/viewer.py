@@ -17,6 +17,8 @@ GIVEN_COLOUR = (40, 110, 220)
 GENERATED_COLOUR = (235, 130, 30)
 POINT_SIZE = 0.004
 """In units of the cameras' distance from the scene."""
+FIRST_DISTANCE = 1.5
+"""Of a visitor, in the first camera's."""
 FRUSTUM_SCALE = 0.08
 
 
@@ -64,6 +66,8 @@ class CloudViewer:
     def show(self, known: GlobalMap) -> None:
         """Put a map on the page."""
         following = self._known is None or self._step.value == len(self._known)
+        if self._known is None:
+            self._face(known)
         self._known = known
         self._cloud = cloud_of(known, votes=self._votes)
         self._step.max = max(2, len(known))
@@ -87,6 +91,17 @@ class CloudViewer:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+    def _face(self, known: GlobalMap) -> None:
+        """A visitor first stands behind the first photographer, upright."""
+        cam_to_world = known.cameras.cam_to_world.double()
+        up = -cam_to_world[:, :3, 1].mean(0).numpy()
+        scene: Any = self._server.scene
+        scene.set_up_direction(up)
+        camera: Any = self._server.initial_camera
+        camera.up = up
+        camera.look_at = np.zeros(3)  # the map's world has the scene at its origin
+        camera.position = FIRST_DISTANCE * cam_to_world[0, :3, 3].numpy()
 
     def _draw(self) -> None:
         if self._cloud is None or self._known is None:

@@ -148,7 +148,7 @@ def _started_map(job: _Job, workshop: Workshop, console: Console) -> GlobalMap:
     photographs = [job.sequence.frames[i].load() for i in job.inputs]
     check_poses(photographs)
     views, confidences = first_views(
-        photographs, depth_source(job.config.depth), job.unit, workshop.generator.image_size
+        photographs, depth_source(job.config.depth), job.unit, workshop.generator.warp_size
     )
     known = map_of_inputs(views, confidences, job.config.complete.tolerance)
     for index, view in enumerate(known.views):

@@ -41,6 +41,8 @@ class TracedGenerator:
     def image_size(self) -> int:
         return SIZE
 
+    warp_size = image_size
+
     def generate(self, references, queries, names, seed=0):
         batch, chosen = query_batch(references, queries, 3, SIZE)
         images = [SCENE.image(batch.camera[i]) for i in range(len(names))]

@@ -1,0 +1,86 @@
+"""The growing cloud in a real browser: it connects, draws, and its sliders choose what is shown."""
+
+import shutil
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import scenes
+import torch
+from PIL import Image
+
+from extrap_train.reconstruction.global_map import GENERATED, GIVEN, GlobalMap, Origin
+from extrap_train.reconstruction.viewer import CloudViewer
+from extrap_train.views import View
+
+_BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+_SIZE = 48
+_SCENE = scenes.Scene((scenes.sphere(0.6), scenes.plane(0.6, (0.0, 1.0, 0.0))))
+
+
+def _grown(count: int) -> GlobalMap:
+    """`count` views of a sphere on a plane, all but the first generated."""
+    known = GlobalMap(0.01)
+    for index in range(count):
+        camera = scenes.orbit_camera(60.0 * index, size=_SIZE)
+        view = View(_SCENE.image(camera), camera, _SCENE.depth(camera), name=f"view{index}")
+        origin = Origin(GENERATED if index else GIVEN, front=0)
+        known, _ = known.added(view, torch.ones(_SIZE, _SIZE), origin)
+    return known
+
+
+@pytest.fixture
+def viewer() -> Iterator[CloudViewer]:
+    pytest.importorskip("viser", reason="needs viser: the extra `viewer`")
+    with CloudViewer(port=8917) as opened:
+        yield opened
+
+
+@pytest.fixture
+def window(viewer: CloudViewer) -> Iterator[Any]:
+    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
+    browser = next(filter(None, map(shutil.which, _BROWSERS)), None)
+    if browser is None:
+        pytest.skip("needs chromium")
+    software = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    with playwright.sync_playwright() as driver:
+        opened = driver.chromium.launch(executable_path=browser, args=software)
+        page = opened.new_page(viewport={"width": 640, "height": 420})
+        page.errors = []
+        page.on("pageerror", lambda error: page.errors.append(str(error)))
+        yield page
+        opened.close()
+
+
+def test_more_views_are_more_points_and_the_sliders_take_them_away(viewer: CloudViewer) -> None:
+    viewer.show(_grown(1))
+    first = viewer.shown_points
+    viewer.show(_grown(3))
+    assert viewer.shown_points > first > 0
+    viewer.select(views=1, least_confidence=0.1)
+    assert viewer.shown_points == first
+    viewer.show(_grown(4))  # whoever has gone back is left in peace
+    assert viewer.shown_points == first
+    viewer.select(views=4, least_confidence=1.0)
+    assert viewer.shown_points <= len(_grown(4)) * _SIZE**2
+
+
+@pytest.mark.slow
+def test_the_page_shows_cloud_and_cameras(viewer: CloudViewer, window: Any, tmp_path: Any) -> None:
+    viewer.show(_grown(3))
+    window.goto(f"http://localhost:{viewer.port}", wait_until="domcontentloaded")
+    window.get_by_text("least confidence").first.wait_for(timeout=120_000)
+    window.wait_for_timeout(4000)
+    shot = tmp_path / "page.png"
+    window.screenshot(path=shot, timeout=120_000)
+    assert not window.errors
+    values = {field.input_value() for field in window.query_selector_all("input")}
+    assert str(viewer.shown_points) in values
+    colours = np.asarray(Image.open(shot).convert("RGB")).reshape(-1, 3).astype(int)
+    # Blue frusta of what was given, orange ones of what was generated, and points of many colours.
+    blue = (colours[:, 2] - colours[:, 0] > 120) & (colours[:, 1] < 150)
+    orange = (colours[:, 0] - colours[:, 2] > 150) & (colours[:, 1] > 90) & (colours[:, 1] < 180)
+    assert blue.any()
+    assert orange.any()
+    assert len(np.unique(colours, axis=0)) > 200
