@@ -1,7 +1,8 @@
 """One draw on disk: what a method receives, and apart from it what its images are scored against.
 
 <folder>/scene.json            the draw, cameras, angles, hashes; written last
-         inputs/0.png …        inputs/depth.npy (0 = unknown; found from the inputs alone)
+         inputs/0.png …        inputs/depth.npy (0 = unknown; found from the inputs alone), at
+                               the finer size
          truth/0.png …         truth/depth.npy and truth/cloud.npy where the capture knows them
          warps/0.png …         masks/0.png …: the fused warp of all inputs, and what it reaches
 """
@@ -37,7 +38,7 @@ from extrap_train.errors import InputError
 from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
 from extrap_train.views import Camera, View, stack_cameras
 
-FORMAT = 1
+FORMAT = 2
 DEPTHS: Mapping[str, DepthConfig] = {"dataset": DatasetDepthConfig(), "stereo": StereoConfig()}
 
 
@@ -97,17 +98,20 @@ class Scene:
         """What a method receives; nothing of the truth is read."""
         draw = self.draw
         cameras = self._cameras("inputs")
-        images = self._pictures("inputs", len(draw.inputs))
+        side, size = self.record["fine_size"], self.record["image_size"]
+        images = self._pictures("inputs", len(draw.inputs), side)
         depths = torch.from_numpy(np.load(self.folder / "inputs" / "depth.npy"))
+        fine = [
+            View(image, cameras[i].resized(side, side), depths[i], name=draw.inputs[i])
+            for i, image in enumerate(images)
+        ]
         return SceneInputs(
             category=draw.category,
-            views=tuple(
-                View(image, cameras[i], depths[i], name=draw.inputs[i])
-                for i, image in enumerate(images)
-            ),
+            views=tuple(view.resized(size, size) for view in fine),
             targets=self._cameras("targets"),
             depth_source=RecordedDepth(float(self.record["depth_seconds"])),
             seed=draw.seed,
+            fine_views=tuple(fine),
         )
 
     def truth(self) -> Truth:
@@ -122,8 +126,8 @@ class Scene:
             cloud=self._array("truth/cloud.npy"),
         )
 
-    def _pictures(self, kind: str, count: int) -> Float[Tensor, "n 3 h w"]:
-        size = (self.record["image_size"], self.record["image_size"])
+    def _pictures(self, kind: str, count: int, side: int | None = None) -> Float[Tensor, "n 3 h w"]:
+        size = (side or self.record["image_size"],) * 2
         return torch.stack(
             [read_image(self.folder / kind / f"{i}.png", size) for i in range(count)]
         )
@@ -176,11 +180,12 @@ def _write_scene(folder: Path, capture: Capture, draw: Draw, rules: RulesConfig)
             f"{draw.category}/{draw.sequence}: has no frame {missing[0]}, which the protocol names"
         )
     photographs = [frames[name].load() for name in draw.inputs]
-    inputs, seconds = _with_depth(photographs, rules)
+    fine_size = size * _fine_scale(photographs, rules)
+    inputs, seconds = _with_depth(photographs, rules.depth, fine_size)
     targets = [frames[name].load().squared(size) for name in draw.targets]
     cameras = stack_cameras([view.camera for view in targets])
     depths = [view.depth for view in inputs if view.depth is not None]
-    warp = with_warp(query_batch(inputs, cameras, len(inputs), size)[0]).warp
+    warp = with_warp(query_batch(inputs, cameras, len(inputs), fine_size)[0], size).warp
     assert warp is not None
     pictures = {
         "inputs": torch.stack([view.image for view in inputs]),
@@ -205,31 +210,38 @@ def _write_scene(folder: Path, capture: Capture, draw: Draw, rules: RulesConfig)
         "format": FORMAT,
         "draw": asdict(draw),
         "image_size": size,
+        "fine_size": fine_size,
         "depth_seconds": seconds,
         "cameras": {
-            "inputs": [_camera_record(view.camera) for view in inputs],
+            "inputs": [_camera_record(view.camera.resized(size, size)) for view in inputs],
             "targets": [_camera_record(view.camera) for view in targets],
         },
-        "angles_rad": _angles_to_nearest(inputs, targets),
+        "angles_rad": _angles_to_nearest([view.resized(size, size) for view in inputs], targets),
         "files": {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()},
     }
 
 
-def _with_depth(photographs: ListOf[View], rules: RulesConfig) -> tuple[list[View], float]:
-    """The inputs at the table's size with their depth, and how long finding it took.
+def _fine_scale(photographs: ListOf[View], rules: RulesConfig) -> int:
+    """What the rules say, but nothing is scaled up."""
+    smallest = min(min(view.camera.height, view.camera.width) for view in photographs)
+    return max(1, min(rules.fine_scale, smallest // rules.image_size))
+
+
+def _with_depth(photographs: ListOf[View], depth_name: str, size: int) -> tuple[list[View], float]:
+    """The inputs at a size with their depth, and how long finding it took.
 
     Depth is found at its source's own resolution, from the inputs alone.
     """
-    source = depth_source(DEPTHS[rules.depth])
-    side = max(rules.image_size, source.image_size or 0)
+    source = depth_source(DEPTHS[depth_name])
+    side = max(size, source.image_size or 0)
     large = [view.squared(side) for view in photographs]
     with Stopwatch() as watch:
         found = [depth.reliable() for depth in source.depth_maps(large)]
     views = []
     for view, depth in zip(large, found, strict=True):
         posed = View(view.image, view.camera, depth, name=view.name)
-        views.append(posed.resized(rules.image_size, rules.image_size))
-    return views, 0.0 if rules.depth == "dataset" else watch.seconds
+        views.append(posed.resized(size, size))
+    return views, 0.0 if depth_name == "dataset" else watch.seconds
 
 
 def _angles_to_nearest(inputs: ListOf[View], targets: ListOf[View]) -> list[float]:

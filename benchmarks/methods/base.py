@@ -43,6 +43,10 @@ class SceneInputs:
     depth_source: DepthSource
     seed: int
     """Seeds everything random; the same inputs and seed give the same images."""
+    fine_views: tuple[View, ...]
+    """The same photographs with their cameras and depth, `rules.fine_scale` times as large: for
+    what would lose thin surfaces at the targets' size, such as a warp.
+    """
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,9 @@ def nearest_inputs(inputs: SceneInputs, count: int) -> list[list[int]]:
 
 
 def views_with_depth(inputs: SceneInputs) -> list[View]:
-    """The inputs with depth from the given source, 0 where it is unsure."""
-    found = inputs.depth_source.depth_maps(inputs.views)
+    """The inputs at their finer size with depth from the given source, 0 where it is unsure."""
+    found = inputs.depth_source.depth_maps(inputs.fine_views)
     return [
         replace(view, depth=depth.reliable())
-        for view, depth in zip(inputs.views, found, strict=True)
+        for view, depth in zip(inputs.fine_views, found, strict=True)
     ]

@@ -11,7 +11,6 @@ from benchmarks.methods.references import nearest_inputs, views_with_depth
 from extrap_train.data.module import with_warp
 from extrap_train.data.queries import query_batch
 from extrap_train.diffusion.baselines import inpainted_warp
-from extrap_train.geometry.reduction import WARP_SCALE
 
 
 @dataclass(frozen=True)
@@ -45,8 +44,7 @@ class InpaintedWarp:
         """Warp and inpaint every target."""
         with Stopwatch() as watch:
             views, size = views_with_depth(inputs), inputs.targets.height
-            fine = WARP_SCALE * size  # as our own warps are made: no rival gets a worse one
-            batch = query_batch(views, inputs.targets, self.references, fine)[0]
+            batch = query_batch(views, inputs.targets, self.references, views[0].camera.height)[0]
             batch = with_warp(batch, size)
             assert batch.warp is not None
             images = inpainted_warp(batch.warp).clamp(0, 1)

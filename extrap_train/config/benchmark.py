@@ -39,6 +39,10 @@ class RulesConfig:
 
     image_size: int = 64
     """Pixels a side of inputs, targets and everything that is scored."""
+    fine_scale: int = 2
+    """Side of the inputs' finer copy over `image_size`, where the photographs are as large: what
+    warps, and so the masks, are made from. Every method is given both.
+    """
     pool: int = 9
     """Frames that farthest-point sampling picks from a capture (paper III-A.1)."""
     views: list[int] = field(default_factory=lambda: [3, 6])

@@ -43,6 +43,7 @@ def scene_inputs(
         targets=stack_cameras([view.camera for view in targets]),
         depth_source=DatasetDepth(),
         seed=0,
+        fine_views=tuple(view_at(angle, 2 * size) for angle in inputs_deg),
     )
     return inputs, torch.stack([view.image for view in targets])
 

@@ -1,5 +1,6 @@
 """A prepared draw gives a method its inputs and nothing else, and notices changed files."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ _RULES = RulesConfig(image_size=32, pool=9)
 
 @pytest.fixture(scope="module")
 def draw_and_scene(tmp_path_factory: pytest.TempPathFactory) -> tuple[Draw, Scene]:
-    capture = Capture(analytic_capture())
+    capture = Capture(analytic_capture(size=64))
     draw = draw_sequence("apple", "one", *_frames(capture.sequence), _RULES)[0]
     folder = tmp_path_factory.mktemp("scenes") / draw.label
     return draw, prepare_scene(folder, capture, draw, _RULES, "origin")
@@ -34,13 +35,15 @@ def _frames(capture):
 def test_inputs_are_the_photographs_with_depth(draw_and_scene: tuple[Draw, Scene]) -> None:
     draw, scene = draw_and_scene
     inputs = scene.inputs()
-    frames = {frame.name: frame.load() for frame in analytic_capture().frames}
-    assert [view.name for view in inputs.views] == list(draw.inputs)
-    for view in inputs.views:
-        true = frames[view.name]
-        torch.testing.assert_close(view.image, true.image, atol=0.5 / 255 + 1e-6, rtol=0)
-        torch.testing.assert_close(view.depth, true.depth)
-        torch.testing.assert_close(view.camera.world_to_cam, true.camera.world_to_cam)
+    frames = {frame.name: frame.load() for frame in analytic_capture(size=64).frames}
+    for size, views in ((32, inputs.views), (64, inputs.fine_views)):
+        assert [view.name for view in views] == list(draw.inputs)
+        for view in views:
+            true = frames[view.name].resized(size, size)
+            torch.testing.assert_close(view.image, true.image, atol=0.5 / 255 + 1e-6, rtol=0)
+            torch.testing.assert_close(view.depth, true.depth)
+            torch.testing.assert_close(view.camera.world_to_cam, true.camera.world_to_cam)
+            torch.testing.assert_close(view.camera.intrinsics, true.camera.intrinsics)
     assert inputs.targets.world_to_cam.shape == (6, 4, 4)
 
 
@@ -72,11 +75,11 @@ def test_what_is_there_is_used_and_what_was_touched_made_anew(
     draw_and_scene: tuple[Draw, Scene],
 ) -> None:
     draw, scene = draw_and_scene
-    capture, folder = Capture(analytic_capture()), scene.folder
+    capture, folder = Capture(analytic_capture(size=64)), scene.folder
     before = (folder / "scene.json").stat().st_ino
     assert prepare_scene(folder, capture, draw, _RULES, "origin").data_hash == scene.data_hash
     assert (folder / "scene.json").stat().st_ino == before
-    np.save(folder / "inputs" / "depth.npy", np.zeros((3, 32, 32), np.float32))
+    np.save(folder / "inputs" / "depth.npy", np.zeros((3, 64, 64), np.float32))
     assert scene.changed_files() == ["inputs/depth.npy"]
     again = prepare_scene(folder, capture, draw, _RULES, "origin")
     assert again.data_hash == scene.data_hash
@@ -98,3 +101,25 @@ def test_estimated_depth_is_charged_to_the_method_that_asks() -> None:
     assert source.seconds == 0
     source.depth_maps([frame.load() for frame in analytic_capture().frames[:2]])
     assert source.seconds == 7.5
+
+
+def test_small_photographs_are_not_scaled_up(
+    draw_and_scene: tuple[Draw, Scene], tmp_path: Path
+) -> None:
+    draw = draw_and_scene[0]
+    small = Capture(analytic_capture(size=32))
+    inputs = prepare_scene(tmp_path / "small", small, draw, _RULES, "").inputs()
+    for fine, view in zip(inputs.fine_views, inputs.views, strict=True):
+        assert torch.equal(fine.image, view.image)
+
+
+def test_masks_of_the_finer_copy_hold_what_the_coarse_ones_reach(
+    draw_and_scene: tuple[Draw, Scene], tmp_path: Path
+) -> None:
+    """A surface that a coarse warp reaches is reached by a finer one; not the other way round."""
+    draw, scene = draw_and_scene
+    capture, coarse = Capture(analytic_capture(size=64)), replace(_RULES, fine_scale=1)
+    before = prepare_scene(tmp_path / "coarse", capture, draw, coarse, "").truth().masks
+    now = scene.truth().masks
+    assert (now >= before).float().mean() > 0.99
+    assert now.mean() > before.mean()

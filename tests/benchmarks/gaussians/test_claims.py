@@ -43,7 +43,7 @@ def capture(category: str, frames: int, size: int) -> list[View]:
 
 def inputs_of(inputs: list[View], targets: list[View], seed: int) -> SceneInputs:
     cameras = stack_cameras([view.camera for view in targets])
-    return SceneInputs("synthetic", tuple(inputs), cameras, DatasetDepth(), seed)
+    return SceneInputs("synthetic", tuple(inputs), cameras, DatasetDepth(), seed, tuple(inputs))
 
 
 def reached(inputs: list[View], targets: list[View]) -> torch.Tensor:
