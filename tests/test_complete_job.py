@@ -13,7 +13,11 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
+from benchmarks.methods.gaussians.drawing import draw
+from benchmarks.methods.gaussians.ply import read_splats
+from benchmarks.methods.gaussians.rasterization import rasterizer
 from extrap_train.data.scene import open_scene
+from extrap_train.metrics import psnr
 
 _TINY = [
     "task=complete",
@@ -24,6 +28,8 @@ _TINY = [
     "complete.generator=exact",
     "complete.exact_size=40",
     "complete.step_deg=60",
+    "complete.splats.iterations=100",
+    "complete.splats.count=2000",
     "threads=1",
 ]
 
@@ -68,7 +74,15 @@ def _content(output: Path) -> dict[str, str]:
 def test_the_contract_of_files_is_kept(undisturbed: Path) -> None:
     folder = _folder(undisturbed)
     names = {path.name for path in folder.iterdir()}
-    expected = {"cloud.ply", "transforms.json", "colmap", "views", "growth.png", "turntable.mp4"}
+    expected = {
+        "cloud.ply",
+        "splats.ply",
+        "transforms.json",
+        "colmap",
+        "views",
+        "growth.png",
+        "turntable.mp4",
+    }
     assert expected | {"plan.png", "summary.json"} <= names
     summary = json.loads((folder / "summary.json").read_text())
     steps = summary["steps"]
@@ -82,6 +96,27 @@ def test_the_contract_of_files_is_kept(undisturbed: Path) -> None:
     assert len(vertices) == summary["points"]
     lengths = np.linalg.norm([vertices["nx"], vertices["ny"], vertices["nz"]], axis=0)
     assert np.abs(lengths - 1).max() < 1e-3
+
+
+def test_the_splats_show_the_completed_views_in_the_photographs_world(undisturbed: Path) -> None:
+    """Seen by the cameras that were written beside them, as another program would read both."""
+    folder = _folder(undisturbed)
+    splats = read_splats(folder / "splats.ply")
+    summary = json.loads((folder / "summary.json").read_text())["splats"]
+    assert len(splats) == len(PlyData.read(folder / "splats.ply")["vertex"]) == summary["gaussians"]
+    scores = []
+    for frame in open_scene(str(folder)).frames:
+        view = frame.load()
+        drawn = draw(rasterizer("numba"), splats, view.camera, 0.0, sh_degree=3).image
+        scores.append(float(psnr(drawn.clamp(0, 1)[None], view.image[None])))
+    assert min(scores) > 22
+    assert np.mean(scores) == pytest.approx(summary["psnr"], abs=0.1)
+
+
+def test_a_second_run_uses_the_splats_again(undisturbed: Path) -> None:
+    before = (_folder(undisturbed) / "splats.ply").stat().st_mtime_ns
+    assert "used again" in _finish(undisturbed)
+    assert (_folder(undisturbed) / "splats.ply").stat().st_mtime_ns == before
 
 
 @pytest.mark.parametrize("where", ["", "colmap"])

@@ -17,7 +17,7 @@ from extrap_train.config.benchmark import (
 )
 from extrap_train.config.checks import required_file, validate
 from extrap_train.config.commands import DataPrepConfig, TrainConfig
-from extrap_train.config.completion import CompletionConfig, ConfidenceConfig
+from extrap_train.config.completion import CompletionConfig, ConfidenceConfig, SplatsConfig
 from extrap_train.config.data import (
     CATEGORIES,
     CategoryConfig,
@@ -87,6 +87,7 @@ __all__ = [
     "SceneOptions",
     "ScoringConfig",
     "SlurmConfig",
+    "SplatsConfig",
     "StereoConfig",
     "SyntheticConfig",
     "TableConfig",

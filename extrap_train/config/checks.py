@@ -86,6 +86,8 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "complete.exact_size": (16, 4096),
     "complete.held_out": (0, math.inf),
     "complete.port": (1, 65535),
+    "complete.splats.iterations": (1, 1_000_000),
+    "complete.splats.count": (1, 10_000_000),
     "complete.confidence.attempts": (1, 100),
     "complete.confidence.least_agreement": (0, 1),
     "complete.confidence.least_confidence": (0, 1),

@@ -26,6 +26,18 @@ class ConfidenceConfig:
 
 
 @dataclass
+class SplatsConfig:
+    """The Gaussians fitted to a completed scene's views: `splats.ply`."""
+
+    fit: bool = True
+    """Whether they are."""
+    iterations: int = 500
+    """Of 3DGS's optimisation."""
+    count: int = 10_000
+    """Most Gaussians."""
+
+
+@dataclass
 class CompletionConfig:
     """From a few posed photographs to a full turn (paper II-C; METHOD §5)."""
 
@@ -43,6 +55,7 @@ class CompletionConfig:
     generator: str = "model"
     """`model` samples pictures; `exact` renders them and their depth, synthetic scenes only."""
     confidence: ConfidenceConfig = field(default_factory=ConfidenceConfig)
+    splats: SplatsConfig = field(default_factory=SplatsConfig)
     exact_size: int = 128
     """Side of the pictures of `generator=exact`, in pixels; a model has its own."""
     held_out: int = 20

@@ -43,7 +43,7 @@ from extrap_train.tasks.completed import Completed, write_completed
 from extrap_train.tasks.scene_inputs import required_scene, trained_model
 from extrap_train.views import stack_cameras, stack_poses
 
-_NOT_PART_OF_THE_MAP = ("dry_run", "viewer", "port", "held_out")
+_NOT_PART_OF_THE_MAP = ("dry_run", "viewer", "port", "held_out", "splats")
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.methods.gaussians.trainer import Diverged
 from extrap_train.config import TrainConfig
 from extrap_train.data.files import write_whole
 from extrap_train.data.sequences import Sequence
@@ -33,6 +34,7 @@ from extrap_train.reconstruction.report import (
     view_consistency,
 )
 from extrap_train.runs import provenance
+from extrap_train.tasks.splats import write_fitted_splats
 from extrap_train.views import stack_cameras
 
 SUBDIVIDE = 3
@@ -73,6 +75,7 @@ def write_completed(
     draw_turntable(done.known, cloud, folder / "turntable.mp4")
     _draw_views(done.known, folder / "views.png")
     done.seconds["export"] = time.perf_counter() - started
+    splats, no_splats = _splats(done, config, folder)
     started = time.perf_counter()
     held_out, missing = _compare_held_out(done, config, sequence, workshop, folder)
     metrics = _metrics(done, cloud)
@@ -82,7 +85,8 @@ def write_completed(
         "points": len(cloud),
         "metrics": metrics,
         "held_out": held_out,
-        "missing": missing,
+        "splats": splats,
+        "missing": missing | no_splats,
         "loop": drift(done.steps, done.known),
         "consistency_db": view_consistency(done.known),
         "sphere_coverage": coverage_of(done.known),
@@ -93,6 +97,19 @@ def write_completed(
     write_whole(folder / "summary.json", (json.dumps(summary, indent=1) + "\n").encode())
     _print(summary, console)
     console.print(f"pictures: {folder / 'growth.png'}\nresult: {folder}")
+
+
+def _splats(
+    done: Completed, config: TrainConfig, folder: Path
+) -> tuple[dict[str, float] | None, dict[str, str]]:
+    """The fitted Gaussians' numbers, or why there are none: the rest of the scene is whole."""
+    options = config.complete.splats
+    if not options.fit:
+        return None, {}
+    try:
+        return write_fitted_splats(done.known, done.unit, options, config.seed, folder), {}
+    except Diverged as error:
+        return None, {"splats": str(error)}
 
 
 def _count(known: GlobalMap, kind: str) -> int:
@@ -193,6 +210,10 @@ def _print(summary: dict[str, Any], console: Console) -> None:
     if summary["held_out"]:
         scores = {k: v for k, v in summary["held_out"].items() if v is not None}
         console.print("held out: " + ", ".join(f"{k} {v:.3f}" for k, v in scores.items()))
+    if summary["splats"]:
+        count, score = summary["splats"]["gaussians"], summary["splats"]["psnr"]
+        again = "" if summary["splats"]["seconds"] else ", used again"
+        console.print(f"splats: {count:.0f} Gaussians show the views at {score:.2f} dB{again}")
     error = summary["loop"]["largest_error"]
     met = "fronts did not meet" if error is None else f"{100 * error:.2f} % of the scene's size"
     console.print(f"loop closure: {met}")

@@ -6,6 +6,7 @@ One vertex a Gaussian, little-endian floats: `x y z`, `nx ny nz` (zeros), `f_dc_
 """
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +23,8 @@ _LEAST = 1e-6
 _DEGREES = range(4)
 
 
-def write_splats(path: Path, gaussians: Gaussians) -> None:
-    """Write a PLY file, whole or not at all."""
+def write_splats(path: Path, gaussians: Gaussians, comments: Sequence[str] = ()) -> None:
+    """Write a PLY file, whole or not at all; `comments` are lines of its header."""
     dc, rest = gaussians.sh[:, 0], gaussians.sh[:, 1:].mT.flatten(1)
     columns = [
         gaussians.means,
@@ -38,13 +39,14 @@ def write_splats(path: Path, gaussians: Gaussians) -> None:
     dtype = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz", *_rest(rest.shape[1]))]
     vertices = np.ascontiguousarray(table).view(dtype)[:, 0]
     content = io.BytesIO()
-    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(content)
+    elements = [PlyElement.describe(vertices, "vertex")]
+    PlyData(elements, byte_order="<", comments=list(comments)).write(content)
     write_whole(path, content.getvalue())
 
 
 def read_splats(path: Path) -> Gaussians:
     """Read a PLY file of any SH degree up to 3, ours or another trainer's."""
-    vertices = _read_vertices(path)
+    vertices = _read(path)["vertex"].data
     given = vertices.dtype.names or ()
     count = sum(name.startswith("f_rest_") for name in given)
     bands = {3 * ((degree + 1) ** 2 - 1) for degree in _DEGREES}
@@ -69,19 +71,27 @@ def read_splats(path: Path) -> Gaussians:
     return Gaussians(means, quats, scale.exp(), opacity[:, 0].sigmoid(), sh)
 
 
+def read_comments(path: Path) -> tuple[str, ...]:
+    """The lines that a PLY file's header says to people."""
+    return tuple(_read(path).comments)
+
+
 def _rest(count: int) -> list[str]:
     """Names of the properties after position and normal."""
     names = [f"f_dc_{i}" for i in range(3)] + [f"f_rest_{i}" for i in range(count)]
     return [*names, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
 
 
-def _read_vertices(path: Path) -> np.ndarray:
+def _read(path: Path) -> PlyData:
     try:
         with path.open("rb") as file:
-            return PlyData.read(file)["vertex"].data
+            content = PlyData.read(file)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except (PlyParseError, ValueError, KeyError, MemoryError) as error:
         raise InputError(
             f"{path}: is no PLY file with vertices ({error}); export it again"
         ) from None
+    if "vertex" not in content:
+        raise InputError(f"{path}: is no PLY file with vertices; export it again")
+    return content

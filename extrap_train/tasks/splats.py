@@ -1,0 +1,100 @@
+"""`splats.ply`: the Gaussians of a completed scene's views, fitted once and used again."""
+
+import hashlib
+import json
+import time
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from benchmarks.methods.gaussians.drawing import BACKGROUNDS, draw
+from benchmarks.methods.gaussians.fit_views import fit_views
+from benchmarks.methods.gaussians.gaussians import Gaussians
+from benchmarks.methods.gaussians.options import GaussianOptions
+from benchmarks.methods.gaussians.ply import read_comments, read_splats, write_splats
+from benchmarks.methods.gaussians.rasterization import rasterizer
+from extrap_train.config import SplatsConfig
+from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.errors import InputError
+from extrap_train.metrics import psnr, quantised
+from extrap_train.pictures import contact_sheet, error_map
+from extrap_train.reconstruction.global_map import GlobalMap
+from extrap_train.reconstruction.inputs import WorldUnit
+from extrap_train.views import View
+
+
+def write_fitted_splats(
+    known: GlobalMap, unit: WorldUnit, options: SplatsConfig, seed: int, folder: Path
+) -> dict[str, float]:
+    """Fit 3DGS to all views of the map, in the photographs' world, from the views' own depth.
+
+    A file that was fitted to the very same is used again. Writes `splats.ply` and, read back from
+    it and drawn, `splats.png`; returns the number of Gaussians, the mean PSNR in dB of what they
+    show of the views, and the seconds that fitting took (0: used again). `Diverged` where fitting
+    fails.
+    """
+    views = [_outside(each.view, unit) for each in known.views]
+    gaussian_options = GaussianOptions(
+        iterations=options.iterations,
+        init="dense",
+        init_points=options.count,
+        max_gaussians=options.count,
+    )
+    path, mark = folder / "splats.ply", _mark(views, gaussian_options, seed)
+    started = time.perf_counter()
+    fresh = not _is_marked(path, mark)
+    if fresh:
+        fitted = fit_views(views, DatasetDepth(), gaussian_options, seed)
+        write_splats(path, fitted.gaussians(), comments=[mark])
+    seconds = time.perf_counter() - started if fresh else 0.0
+    splats = read_splats(path)
+    truth = torch.stack([view.image for view in views])
+    drawn = quantised(_drawn(_inside(splats, unit), known, gaussian_options))
+    contact_sheet(
+        {"view": truth, "splats": drawn, "error": error_map(drawn, truth)}, folder / "splats.png"
+    )
+    score = float(psnr(drawn, truth).mean())
+    return {"gaussians": float(len(splats)), "psnr": score, "seconds": seconds}
+
+
+def _outside(view: View, unit: WorldUnit) -> View:
+    """A view of the map in the photographs' world."""
+    assert view.depth is not None
+    return replace(view, camera=unit.outside(view.camera), depth=view.depth * unit.unit)
+
+
+def _mark(views: list[View], options: GaussianOptions, seed: int) -> str:
+    """Names everything that decides the Gaussians, but for the code."""
+    content = hashlib.sha256(json.dumps([asdict(options), seed]).encode())
+    for view in views:
+        assert view.depth is not None
+        tensors = (view.image, view.depth, view.camera.world_to_cam, view.camera.intrinsics)
+        for tensor in tensors:
+            content.update(tensor.numpy().tobytes())
+    return f"fitted to {len(views)} views, sha256 {content.hexdigest()}"
+
+
+def _is_marked(path: Path, mark: str) -> bool:
+    try:
+        return mark in read_comments(path)
+    except InputError:  # not there, or cut off: fitted anew
+        return False
+
+
+def _inside(splats: Gaussians, unit: WorldUnit) -> Gaussians:
+    """Gaussians of the photographs' world in the map's, whose unit suits the near plane."""
+    means = (splats.means - unit.center.to(splats.means)) / unit.unit
+    return replace(splats, means=means, scales=splats.scales / unit.unit)
+
+
+@torch.no_grad()
+def _drawn(
+    splats: Gaussians, known: GlobalMap, options: GaussianOptions
+) -> Float[Tensor, "n 3 h w"]:
+    rasterize, behind = rasterizer(options.rasterizer), BACKGROUNDS[options.background]
+    cameras = [view.camera for view in known.views]
+    drawn = [draw(rasterize, splats, camera, behind, options.sh_degree) for camera in cameras]
+    return torch.stack([each.image for each in drawn]).clamp(0, 1)
