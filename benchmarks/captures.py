@@ -14,7 +14,7 @@ from data_prep.filter import judge_all
 from data_prep.split import split_sequences
 from extrap_train.config import CapturesConfig, PrepConfig, RulesConfig, SyntheticConfig
 from extrap_train.data.co3d import read_category
-from extrap_train.data.files import read_json
+from extrap_train.data.json_files import read_json
 from extrap_train.data.photographs import CATEGORY as NO_CATEGORY
 from extrap_train.data.posed import TRANSFORMS, read_transforms
 from extrap_train.data.scene import open_scene

@@ -29,7 +29,8 @@ from benchmarks.recorded_depth import RecordedDepth
 from benchmarks.scenes import Scene, png_bytes
 from benchmarks.scoring import Score, score_images
 from extrap_train.config import MethodConfig, ScoringConfig
-from extrap_train.data.files import read_json, write_whole
+from extrap_train.data.files import write_whole
+from extrap_train.data.json_files import read_json
 from extrap_train.errors import InputError
 from extrap_train.metrics import require_unit_range
 

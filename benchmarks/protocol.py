@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Float
 
 from extrap_train.config import RulesConfig
-from extrap_train.data.files import read_json, write_whole
+from extrap_train.data.files import write_whole
+from extrap_train.data.json_files import read_json
 from extrap_train.errors import InputError
 from extrap_train.geometry.viewpoints import (
     camera_centers,

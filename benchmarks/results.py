@@ -12,7 +12,7 @@ from jaxtyping import Float
 from benchmarks.cells import OK, read_cell
 from benchmarks.plan import TableFolder
 from benchmarks.scenes import Scene
-from extrap_train.data.files import read_json
+from extrap_train.data.json_files import read_json
 from extrap_train.errors import InputError
 
 RESAMPLES = 2000

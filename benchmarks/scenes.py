@@ -29,8 +29,9 @@ from benchmarks.methods.base import SceneInputs, Stopwatch
 from benchmarks.protocol import Draw, digest, draw_of
 from benchmarks.recorded_depth import RecordedDepth
 from extrap_train.config import DatasetDepthConfig, DepthConfig, RulesConfig, StereoConfig
-from extrap_train.data.files import read_json, write_whole
+from extrap_train.data.files import write_whole
 from extrap_train.data.images import read_image, to_eight_bits
+from extrap_train.data.json_files import read_json
 from extrap_train.data.module import with_warp
 from extrap_train.data.queries import query_batch
 from extrap_train.depth.build import depth_source

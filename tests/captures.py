@@ -22,11 +22,17 @@ def view_at(azimuth_deg: float, size: int = 32) -> View:
     return View(SCENE.image(camera), camera, depth, mask)
 
 
-def write_capture(root: Path, names: tuple[str, ...] = ("one", "two"), frames: int = 3) -> None:
+def write_capture(
+    root: Path,
+    names: tuple[str, ...] = ("one", "two"),
+    frames: int = 3,
+    size: int = 32,
+    step_deg: float = 30,
+) -> None:
     """Category `cup` with sequences of a few frames; the frame numbers are 1, 11, 21, …"""
     entries = [
         # Written backwards: the reader is to sort.
-        write_frame(root, "cup", name, 10 * index + 1, view_at(30 * index))
+        write_frame(root, "cup", name, 10 * index + 1, view_at(step_deg * index, size))
         for name in names
         for index in reversed(range(frames))
     ]

@@ -1,13 +1,13 @@
 """CO3D's annotation entries (v1 and v2) as typed records, their JSON checked."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from extrap_train.data.files import check_relative, read_json
+from extrap_train.data.files import check_relative
 from extrap_train.data.images import MAX_PIXELS
-from extrap_train.data.validation import require_list
+from extrap_train.data.json_files import read_json_list
 from extrap_train.errors import InputError
 from extrap_train.geometry.pytorch3d import NDC_FORMATS
 
@@ -49,22 +49,20 @@ class SequenceAnnotation:
     point_cloud_quality: float | None
 
 
-def read_frame_annotations(file: Path) -> list[FrameAnnotation]:
-    """Every entry of a `frame_annotations.jgz`, in the file's order."""
-    return _parse_all(file, _frame)
+def read_frame_annotations(file: Path) -> Iterator[FrameAnnotation]:
+    """Every entry of a `frame_annotations.jgz`, in the file's order, one at a time."""
+    return _parsed(file, _frame)
 
 
 def read_sequence_annotations(file: Path) -> dict[str, SequenceAnnotation]:
     """The entries of a `sequence_annotations.jgz` by their sequence's name."""
-    return {entry.name: entry for entry in _parse_all(file, _sequence)}
+    return {entry.name: entry for entry in _parsed(file, _sequence)}
 
 
-def _parse_all(file: Path, parse: Callable[[Any, Path], T]) -> list[T]:
-    entries = require_list(read_json(file), "annotations", file)
-    parsed = []
-    for index, entry in enumerate(entries):
+def _parsed(file: Path, parse: Callable[[Any, Path], T]) -> Iterator[T]:
+    for index, entry in enumerate(read_json_list(file, "annotations")):
         try:
-            parsed.append(parse(entry, file))
+            parsed = parse(entry, file)
         except KeyError as error:
             raise InputError(
                 f"{file}: entry {index} has no {error}; is this a CO3D annotation file?"
@@ -75,7 +73,7 @@ def _parse_all(file: Path, parse: Callable[[Any, Path], T]) -> list[T]:
             raise InputError(
                 f"{file}: entry {index} is malformed ({error}); is this a CO3D annotation file?"
             ) from None
-    return parsed
+        yield parsed
 
 
 def _frame(entry: Any, file: Path) -> FrameAnnotation:

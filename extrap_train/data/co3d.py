@@ -9,36 +9,28 @@ import logging
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-import torch
-
 from extrap_train.data.annotations import (
-    DepthFiles,
     FrameAnnotation,
     SequenceAnnotation,
     read_frame_annotations,
     read_sequence_annotations,
 )
-from extrap_train.data.co3d_cameras import cameras_of
-from extrap_train.data.files import check_relative, read_json, resolve_inside
-from extrap_train.data.images import (
-    known_depth,
-    read_depth_mask,
-    read_image,
-    read_mask,
-    read_sixteen_bit,
-)
-from extrap_train.data.sequences import Frame, Sequence
+from extrap_train.data.co3d_frames import Co3dFrames
+from extrap_train.data.files import check_relative
+from extrap_train.data.json_files import read_json
+from extrap_train.data.sequences import Sequence
 from extrap_train.data.validation import require_dict
 from extrap_train.errors import InputError, did_you_mean
-from extrap_train.views import Camera, View
 
 FRAME_ANNOTATIONS = "frame_annotations.jgz"
 SEQUENCE_ANNOTATIONS = "sequence_annotations.jgz"
+
+_ENTRIES_AT_A_TIME = 4096
+"""Parsed JSON takes twenty times the room of what is kept of it."""
 
 log = logging.getLogger(__name__)
 
@@ -49,32 +41,6 @@ class FrameId(NamedTuple):
     sequence: str
     number: int
     path: str
-
-
-@dataclass(frozen=True, slots=True)
-class _Photograph:
-    """One frame's files; a dataclass and no closure, so that worker processes can be sent it."""
-
-    root: Path
-    image_path: str
-    depth: DepthFiles | None
-    mask_path: str | None
-    camera: Camera
-
-    @property
-    def name(self) -> str:
-        return self.image_path.rpartition("/")[2]
-
-    def load(self) -> View:
-        size = self.camera.height, self.camera.width
-        mask_path = self.mask_path and resolve_inside(self.root, self.mask_path)
-        return View(
-            image=read_image(resolve_inside(self.root, self.image_path), size),
-            camera=self.camera,
-            depth=_read_depth(self.root, self.depth, size) if self.depth else None,
-            mask=read_mask(mask_path, size) if mask_path else None,
-            name=self.name,
-        )
 
 
 def list_categories(root: Path) -> list[str]:
@@ -93,9 +59,9 @@ def read_category(root: Path, category: str) -> list[Sequence]:
     file = root / category / FRAME_ANNOTATIONS
     with _collector_paused():
         details = read_sequence_annotations(root / category / SEQUENCE_ANNOTATIONS)
-        posed = _posed_by_sequence(file)
+        posed = _posed_by_sequence(root, file)
         return [
-            # Popped: what was parsed goes as soon as its sequence is made.
+            # Popped: its parts go as soon as the sequence is made.
             _sequence(root, category, name, posed.pop(name), details.get(name), file)
             for name in sorted(posed)
         ]
@@ -113,18 +79,33 @@ def _collector_paused() -> Iterator[None]:
             gc.enable()
 
 
-def _posed_by_sequence(file: Path) -> dict[str, list[FrameAnnotation]]:
-    annotations = read_frame_annotations(file)
-    posed: dict[str, list[FrameAnnotation]] = defaultdict(list)
-    for annotation in annotations:
-        if annotation.viewpoint is not None:
-            posed[annotation.sequence].append(annotation)
-    without_camera = len(annotations) - sum(map(len, posed.values()))
+def _posed_by_sequence(root: Path, file: Path) -> dict[str, list[Co3dFrames]]:
+    """The frames that have a camera; a sequence's entries need not stand together."""
+    posed: dict[str, list[Co3dFrames]] = defaultdict(list)
+    entries, count = read_frame_annotations(file), 0
+    while taken := _take(islice(entries, _ENTRIES_AT_A_TIME), posed, root, file):
+        count += taken
+    without_camera = count - sum(len(part) for parts in posed.values() for part in parts)
     if without_camera:
         log.warning("%s: %d frames have no camera and are left out", file, without_camera)
     if not posed:
         raise InputError(f"{file}: no frame has a camera; choose another category")
     return posed
+
+
+def _take(
+    entries: Iterator[FrameAnnotation], posed: dict[str, list[Co3dFrames]], root: Path, file: Path
+) -> int:
+    """Add the entries that have a camera to `posed`, as columns; returns how many there were."""
+    by_sequence: dict[str, list[FrameAnnotation]] = defaultdict(list)
+    count = 0
+    for annotation in entries:
+        count += 1
+        if annotation.viewpoint is not None:
+            by_sequence[annotation.sequence].append(annotation)
+    for name, annotations in by_sequence.items():
+        posed[name].append(Co3dFrames.of(root, annotations, file))
+    return count
 
 
 def read_sequence(root: Path, category: str, name: str) -> Sequence:
@@ -161,43 +142,19 @@ def _sequence(
     root: Path,
     category: str,
     name: str,
-    annotations: list[FrameAnnotation],
+    parts: list[Co3dFrames],
     details: SequenceAnnotation | None,
     file: Path,
 ) -> Sequence:
-    annotations.sort(key=lambda annotation: annotation.number)
-    if len({annotation.image_path for annotation in annotations}) != len(annotations):
+    frames = Co3dFrames.joined(parts)
+    if frames.has_duplicates:
         raise InputError(f"{file}: sequence {name} lists an image twice; remove the second entry")
     cloud = details.point_cloud_path if details else None
     return Sequence(
         category=category,
         name=name,
-        frames=tuple(
-            _frame(root, annotation, camera)
-            for annotation, camera in zip(annotations, cameras_of(annotations, file), strict=True)
-        ),
+        frames=frames,
         viewpoint_quality=details.viewpoint_quality if details else None,
         point_cloud_quality=details.point_cloud_quality if details else None,
         point_cloud=root / cloud if cloud else None,
     )
-
-
-def _frame(root: Path, annotation: FrameAnnotation, camera: Camera) -> Frame:
-    photograph = _Photograph(
-        root, annotation.image_path, annotation.depth, annotation.mask_path, camera
-    )
-    return Frame(
-        name=photograph.name,
-        camera=camera,
-        has_depth=annotation.depth is not None,
-        has_mask=annotation.mask_path is not None,
-        load=photograph.load,
-    )
-
-
-def _read_depth(root: Path, files: DepthFiles, size: tuple[int, int]) -> torch.Tensor:
-    path = resolve_inside(root, files.path)
-    depth = known_depth(read_sixteen_bit(path, size).view(np.float16), files.scale, path)
-    if files.mask_path:
-        depth *= read_depth_mask(resolve_inside(root, files.mask_path), size)
-    return depth

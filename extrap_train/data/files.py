@@ -1,21 +1,14 @@
 """Files from outside, read with care, and files of ours, written whole or not at all."""
 
-import gzip
-import json
 import os
 import re
 import shutil
-import zlib
 from pathlib import Path
-from typing import Any
 
 from extrap_train.errors import InputError
 
 MAX_NAME_BYTES = 255
 """Of a file or folder, on every common file system."""
-GZIP_FLOOR_BYTES = 64 * 2**20
-GZIP_RATIO = 100
-"""Annotations shrink to between a third and a tenth; a decompression bomb, to a thousandth."""
 
 # Absolute, on a Windows drive, with a `..` among its parts, or with a NUL that would end it early.
 _LEAVES_FOLDER = re.compile(r"^[/\\]|^[A-Za-z]:|(^|[/\\])\.\.([/\\]|$)|\0")
@@ -61,37 +54,6 @@ def resolve_inside(root: Path, relative: str) -> Path:
     if not exists:
         raise InputError(f"{path}: no such file; restore it or remove its entry")
     return resolved
-
-
-def read_json(path: Path) -> Any:
-    """The content of a JSON file; `.jgz` and `.gz` files are gzip-compressed."""
-    try:
-        content = _gunzip(path) if path.suffix in (".jgz", ".gz") else path.read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; is the download complete?") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error}); check the file") from None
-    try:
-        return json.loads(content)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: is not valid JSON ({error}); download it again") from None
-
-
-def _gunzip(path: Path) -> bytes:
-    limit = GZIP_FLOOR_BYTES + GZIP_RATIO * path.stat().st_size
-    try:
-        with gzip.open(path) as file:
-            content = file.read(limit + 1)
-    except gzip.BadGzipFile:
-        raise InputError(f"{path}: is not a gzip file; download it again") from None
-    except (EOFError, zlib.error):
-        raise InputError(f"{path}: is a truncated or damaged gzip file; get it again") from None
-    if len(content) > limit:
-        raise InputError(
-            f"{path}: expands to more than {limit >> 20} MiB, which no real annotation file does; "
-            "download it again from a source you trust"
-        )
-    return content
 
 
 def write_whole(path: Path, content: bytes) -> None:

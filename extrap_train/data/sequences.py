@@ -1,6 +1,7 @@
 """Captures on disk: a sequence of posed frames, read lazily, whatever the format they came in."""
 
 from collections.abc import Callable
+from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,7 +28,8 @@ class Sequence:
 
     category: str
     name: str
-    frames: tuple[Frame, ...]
+    frames: ListOf[Frame]
+    """In the order in which they were taken."""
     viewpoint_quality: float | None = None
     """CO3D's score of its camera poses; None where the capture has none."""
     point_cloud_quality: float | None = None

@@ -7,6 +7,7 @@ from captures import frame_entries, replace_frame_entries, view_at, write_captur
 from PIL import Image
 from plyfile import PlyData
 
+from extrap_train.data import co3d
 from extrap_train.data.co3d import list_categories, read_category, read_sequence, read_set_list
 from extrap_train.geometry.cameras import project
 
@@ -115,9 +116,34 @@ def test_depth_is_scaled_and_what_is_no_depth_is_unknown(root):
 
 
 def test_frames_can_be_sent_to_worker_processes(root):
-    frame = read_category(root, "cup")[0].frames[0]
+    frames = read_category(root, "cup")[0].frames
+    frame = pickle.loads(pickle.dumps(frames))[0]
     again = pickle.loads(pickle.dumps(frame)).load()
     torch.testing.assert_close(again.image, frame.load().image)
+
+
+def test_entries_need_not_stand_together(root, monkeypatch):
+    monkeypatch.setattr(co3d, "_ENTRIES_AT_A_TIME", 4)
+    expected = read_category(root, "cup")
+    entries = frame_entries(root)
+    replace_frame_entries(root, [*entries[::2], *entries[1::2]])
+    for one, other in zip(read_category(root, "cup"), expected, strict=True):
+        assert one.name == other.name
+        assert [frame.name for frame in one.frames] == [frame.name for frame in other.frames]
+        for first, second in zip(one.frames, other.frames, strict=True):
+            assert torch.equal(first.camera.world_to_cam, second.camera.world_to_cam)
+            assert torch.equal(first.load().depth, second.load().depth)
+
+
+def test_frames_are_a_sequence_from_both_ends(root):
+    frames = read_category(root, "cup")[0].frames
+    names = [frame.name for frame in frames]
+    assert len(frames) == 3
+    assert frames[-1].name == names[2]
+    assert [frame.name for frame in frames[1:]] == names[1:]
+    assert [frame.name for frame in reversed(frames)] == names[::-1]
+    with pytest.raises(IndexError):
+        frames[3]
 
 
 def test_frames_of_different_sizes_keep_their_own_camera(root):

@@ -9,7 +9,7 @@ from captures import frame_entries, replace_frame_entries, write_capture
 from PIL import Image
 
 from extrap_train.data.co3d import read_category, read_sequence, read_set_list
-from extrap_train.data.files import GZIP_FLOOR_BYTES
+from extrap_train.data.json_files import GZIP_FLOOR_BYTES
 from extrap_train.errors import InputError
 
 ANNOTATIONS = "frame_annotations.jgz"

@@ -1,0 +1,165 @@
+"""The frames of one CO3D sequence in a few arrays: a category has half a million of them."""
+
+import os
+from collections.abc import Iterable
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import overload
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, Shaped
+from torch import Tensor
+
+from extrap_train.data.annotations import DepthFiles, FrameAnnotation
+from extrap_train.data.co3d_cameras import cameras_of
+from extrap_train.data.files import resolve_inside
+from extrap_train.data.images import (
+    known_depth,
+    read_depth_mask,
+    read_image,
+    read_mask,
+    read_sixteen_bit,
+)
+from extrap_train.data.sequences import Frame
+from extrap_train.views import Camera, View
+
+
+@dataclass(frozen=True, slots=True)
+class _Photograph:
+    """One frame's files; a dataclass and no closure, so that worker processes can be sent it."""
+
+    root: Path
+    image_path: str
+    depth: DepthFiles | None
+    mask_path: str | None
+    camera: Camera
+
+    @property
+    def name(self) -> str:
+        return self.image_path.rpartition("/")[2]
+
+    def load(self) -> View:
+        size = self.camera.height, self.camera.width
+        mask_path = self.mask_path and resolve_inside(self.root, self.mask_path)
+        return View(
+            image=read_image(resolve_inside(self.root, self.image_path), size),
+            camera=self.camera,
+            depth=_read_depth(self.root, self.depth, size) if self.depth else None,
+            mask=read_mask(mask_path, size) if mask_path else None,
+            name=self.name,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Co3dFrames(ListOf[Frame]):
+    """Some frames of one sequence; each is made when it is asked for.
+
+    Columns with a row a frame, about 350 bytes instead of the 7,000 of as many small objects. Paths
+    are the system's bytes, empty where there is no file.
+    """
+
+    root: Path
+    number: Int[np.ndarray, "n"]
+    size: Int[np.ndarray, "n 2"]
+    """(height, width) in pixels."""
+    world_to_cam: Float[np.ndarray, "n 4 4"]
+    intrinsics: Float[np.ndarray, "n 3 3"]
+    image_path: Shaped[np.ndarray, "n"]
+    mask_path: Shaped[np.ndarray, "n"]
+    depth_path: Shaped[np.ndarray, "n"]
+    depth_mask_path: Shaped[np.ndarray, "n"]
+    depth_scale: Float[np.ndarray, "n"]
+
+    @classmethod
+    def of(cls, root: Path, annotations: list[FrameAnnotation], file: Path) -> "Co3dFrames":
+        """In the annotations' order; InputError that names `file` where a camera is degenerate."""
+        cameras = cameras_of(annotations, file)
+        depths = [annotation.depth for annotation in annotations]
+        return cls(
+            root=root,
+            number=np.array([annotation.number for annotation in annotations], np.int64),
+            size=np.array([annotation.size for annotation in annotations], np.int32),
+            world_to_cam=np.stack([camera.world_to_cam.numpy() for camera in cameras]),
+            intrinsics=np.stack([camera.intrinsics.numpy() for camera in cameras]),
+            image_path=_encoded(annotation.image_path for annotation in annotations),
+            mask_path=_encoded(annotation.mask_path for annotation in annotations),
+            depth_path=_encoded(depth and depth.path for depth in depths),
+            depth_mask_path=_encoded(depth and depth.mask_path for depth in depths),
+            depth_scale=np.array([depth.scale if depth else 0.0 for depth in depths]),
+        )
+
+    @classmethod
+    def joined(cls, parts: ListOf["Co3dFrames"]) -> "Co3dFrames":
+        """All frames of the parts, by number."""
+        order = np.argsort(np.concatenate([part.number for part in parts]), kind="stable")
+        names = [field.name for field in fields(cls) if field.name != "root"]
+        columns = {
+            name: np.concatenate([getattr(part, name) for part in parts])[order] for name in names
+        }
+        return cls(root=parts[0].root, **columns)
+
+    @property
+    def has_duplicates(self) -> bool:
+        """Whether a photograph is listed twice."""
+        return len(np.unique(self.image_path)) < len(self)
+
+    def __len__(self) -> int:
+        return len(self.number)
+
+    @overload
+    def __getitem__(self, index: int) -> Frame: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> tuple[Frame, ...]: ...
+
+    def __getitem__(self, index: int | slice) -> Frame | tuple[Frame, ...]:
+        if isinstance(index, slice):
+            return tuple(self._frame(i) for i in range(*index.indices(len(self))))
+        return self._frame(index)
+
+    def _frame(self, index: int) -> Frame:
+        height, width = self.size[index].tolist()
+        # Copied: a frame that is sent to another process must not take its whole sequence along.
+        camera = Camera(
+            torch.tensor(self.world_to_cam[index]),
+            torch.tensor(self.intrinsics[index]),
+            height,
+            width,
+        )
+        photograph = _Photograph(
+            self.root,
+            os.fsdecode(self.image_path[index]),
+            self._depth(index),
+            os.fsdecode(self.mask_path[index]) or None,
+            camera,
+        )
+        return Frame(
+            name=photograph.name,
+            camera=camera,
+            has_depth=photograph.depth is not None,
+            has_mask=photograph.mask_path is not None,
+            load=photograph.load,
+        )
+
+    def _depth(self, index: int) -> DepthFiles | None:
+        if not self.depth_path[index]:
+            return None
+        return DepthFiles(
+            os.fsdecode(self.depth_path[index]),
+            float(self.depth_scale[index]),
+            os.fsdecode(self.depth_mask_path[index]) or None,
+        )
+
+
+def _encoded(paths: Iterable[str | None]) -> Shaped[np.ndarray, "n"]:
+    return np.array([os.fsencode(path or "") for path in paths])
+
+
+def _read_depth(root: Path, files: DepthFiles, size: tuple[int, int]) -> Float[Tensor, "h w"]:
+    path = resolve_inside(root, files.path)
+    depth = known_depth(read_sixteen_bit(path, size).view(np.float16), files.scale, path)
+    if files.mask_path:
+        depth *= read_depth_mask(resolve_inside(root, files.mask_path), size)
+    return depth

@@ -1,0 +1,146 @@
+"""JSON from outside, read with care; long lists one entry at a time."""
+
+import codecs
+import gzip
+import json
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NoReturn
+
+from extrap_train.data.validation import require_list
+from extrap_train.errors import InputError
+
+GZIP_FLOOR_BYTES = 64 * 2**20
+GZIP_RATIO = 100
+"""Annotations shrink to between a third and a tenth; a decompression bomb, to a thousandth."""
+_PIECE_BYTES = 2**20
+_SPACE = " \t\r\n"
+
+
+def read_json(path: Path) -> Any:
+    """The content of a JSON file; `.jgz` and `.gz` files are gzip-compressed."""
+    content = b"".join(_pieces(path))
+    try:
+        return json.loads(content)
+    except (ValueError, RecursionError) as error:
+        _refuse(path, error)
+
+
+def read_json_list(path: Path, what: str) -> Iterator[Any]:
+    """The entries of a JSON file that is one list, `what` of which is said where it is none.
+
+    Of the file, no more than an entry and a piece are in memory at a time. Raises InputError as
+    `read_json` does, once everything before the fault has been given.
+    """
+    text = _Text(path)
+    if text.peek() != "[":
+        require_list(read_json(path), what, path)
+    text.take()
+    if text.peek() == "]":
+        require_list([], what, path)
+    while True:
+        yield text.value()
+        separator = text.take()
+        if separator == "]":
+            break
+        if separator != ",":
+            _refuse(path, ValueError("Expecting ',' delimiter"))
+    if text.peek():
+        _refuse(path, ValueError("Extra data"))
+
+
+class _Text:
+    """A file's text from one place on, read on as far as is needed."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._decode = json.JSONDecoder().raw_decode
+        self._pieces = _decoded(path)
+        self._text, self._at = "", 0
+
+    def peek(self) -> str:
+        """The next character that is no space; empty at the end."""
+        while True:
+            while self._at < len(self._text):
+                if self._text[self._at] not in _SPACE:
+                    return self._text[self._at]
+                self._at += 1
+            if not self._read_on(1):
+                return ""
+
+    def take(self) -> str:
+        """The same, and go past it."""
+        character = self.peek()
+        self._at += 1
+        return character
+
+    def value(self) -> Any:
+        """The value that begins here."""
+        self.peek()
+        while True:
+            try:
+                value, end = self._decode(self._text, self._at)
+            except (ValueError, RecursionError) as error:
+                # Cut off by the piece's end, or wrong? Twice as much each time, so that a long
+                # value is not begun more often than its length has digits.
+                if isinstance(error, RecursionError) or not self._read_on(len(self._text)):
+                    _refuse(self.path, error)
+                continue
+            # A number may go on in the next piece.
+            if end == len(self._text) and self._read_on(1):
+                continue
+            self._at = end
+            return value
+
+    def _read_on(self, least: int) -> bool:
+        """At least so many more characters, if there are any; what lies behind is forgotten."""
+        parts, length = [self._text[self._at :]], 0
+        for piece in self._pieces:
+            parts.append(piece)
+            length += len(piece)
+            if length >= least:
+                break
+        self._text, self._at = "".join(parts), 0
+        return length > 0
+
+
+def _decoded(path: Path) -> Iterator[str]:
+    decoder = codecs.getincrementaldecoder("utf-8-sig")()
+    try:
+        for piece in _pieces(path):
+            yield decoder.decode(piece)
+        yield decoder.decode(b"", final=True)
+    except UnicodeDecodeError as error:
+        _refuse(path, error)
+
+
+def _pieces(path: Path) -> Iterator[bytes]:
+    """A file's bytes, gunzipped where its name says so."""
+    try:
+        zipped = path.suffix in (".jgz", ".gz")
+        limit = GZIP_FLOOR_BYTES + GZIP_RATIO * path.stat().st_size
+        length = 0
+        with gzip.open(path) if zipped else path.open("rb") as file:
+            while piece := file.read(_PIECE_BYTES):
+                length += len(piece)
+                if length > limit:
+                    raise InputError(
+                        f"{path}: expands to more than {limit >> 20} MiB, which no real annotation "
+                        "file does; download it again from a source you trust"
+                    )
+                yield piece
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; is the download complete?") from None
+    except gzip.BadGzipFile:
+        raise InputError(f"{path}: is not a gzip file; download it again") from None
+    except (EOFError, zlib.error):
+        raise InputError(f"{path}: is a truncated or damaged gzip file; get it again") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error}); check the file") from None
+
+
+def _refuse(path: Path, error: Exception) -> NoReturn:
+    # Where in the file is not known any more, and no matter.
+    reason = error.msg if isinstance(error, json.JSONDecodeError) else error
+    raise InputError(f"{path}: is not valid JSON ({reason}); download it again") from None
