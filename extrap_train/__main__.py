@@ -1,12 +1,14 @@
 """`python -m extrap_train`: configuration to task, nothing else."""
 
+from pathlib import Path
+
 from extrap_train.cli import command
 from extrap_train.config import TrainConfig
 from extrap_train.tasks import task
 
 
-def _run(config: TrainConfig) -> None:
-    task(config.task)(config)
+def _run(config: TrainConfig) -> Path | None:
+    return task(config.task)(config)
 
 
 def main() -> None:

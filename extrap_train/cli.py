@@ -9,6 +9,7 @@ import re
 import sys
 from collections.abc import Callable
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 import hydra
@@ -56,8 +57,10 @@ def register_schemas() -> None:
             store.store(group=group, name=f"{name}_schema", node=variant)
 
 
-def command(name: str, run: Callable[[Any], None]) -> None:
+def command(name: str, run: Callable[[Any], Path | None]) -> None:
     """Compose the configuration `conf/<name>.yaml` with the command line's overrides and run it.
+
+    `run` may return its result's folder: a sweep takes the numbers of its `summary.json`.
 
     An option that does not exist, a value of the wrong type, an unknown category and unusable input
     end with one line on stderr and exit status 1.
@@ -65,17 +68,17 @@ def command(name: str, run: Callable[[Any], None]) -> None:
     register_schemas()
 
     @hydra.main(version_base="1.3", config_path="pkg://conf", config_name=name)
-    def composed(config: DictConfig) -> None:
+    def composed(config: DictConfig) -> Path | None:
         try:
             typed = typed_config(config)
             _use_threads(getattr(typed, "threads", None))
-            run(typed)
+            return run(typed)
         except InputError as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise  # the other jobs of a sweep still run
             sys.exit(f"error: {error}")  # before Hydra adds a line of its own
         except OSError as error:
-            if error.errno not in _NO_ROOM:
+            if error.errno not in _NO_ROOM or HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise
             where = error.filename or getattr(typed, "output", ".")
             sys.exit(f"error: {where}: {error.strerror}; free space or choose another output=")

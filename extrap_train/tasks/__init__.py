@@ -1,6 +1,7 @@
 """What the command line can do: each task composes the other rooms and owns no mathematics."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 TASKS = (
@@ -13,9 +14,12 @@ TASKS = (
 """Known values of `task=`; each is a module here with `run(config)`."""
 
 
-def task(name: str) -> Callable[[Any], None]:
-    """The task's function, imported only now: `--help` needs no torch."""
+def task(name: str) -> Callable[[Any], Path | None]:
+    """The task's function, imported only now: `--help` needs no torch.
+
+    It returns the folder of its result, where there is a `summary.json` in it.
+    """
     from importlib import import_module
 
-    run: Callable[[Any], None] = import_module(f"extrap_train.tasks.{name}").run
+    run: Callable[[Any], Path | None] = import_module(f"extrap_train.tasks.{name}").run
     return run

@@ -36,7 +36,7 @@ from extrap_train.tasks.prepare import prepare_category
 from extrap_train.tasks.results import Results, draw_views, is_finished, write_results
 
 
-def run(config: TrainConfig) -> None:
+def run(config: TrainConfig) -> Path:
     """Train a category model and leave weights, metrics, pictures and `summary.json` behind."""
     console = Console()
     _quieten_lightning()
@@ -50,12 +50,13 @@ def run(config: TrainConfig) -> None:
             if config.resume and is_finished(folder, config):
                 point_latest(folder)
                 console.print(f"already trained for {config.trainer.steps} steps: {folder.path}")
-                return
-            _train(config, folder, model, distance, missing, console)
+            else:
+                _train(config, folder, model, distance, missing, console)
     except Timeout:
         raise InputError(
             f"{folder.path}: another process is training this run; wait for it or give run=NAME"
         ) from None
+    return folder.path
 
 
 def _train(

@@ -58,7 +58,7 @@ class _Job:
     unit: WorldUnit
 
 
-def run(config: TrainConfig) -> None:
+def run(config: TrainConfig) -> Path:
     """Complete a scene; a second run resumes after the last whole view, or says that it is done."""
     job = _job(config)
     console = Console()
@@ -70,6 +70,7 @@ def run(config: TrainConfig) -> None:
         raise InputError(
             f"{job.folder}: another process is completing this scene; wait for it or give run=NAME"
         ) from None
+    return job.folder
 
 
 def _job(config: TrainConfig) -> _Job:

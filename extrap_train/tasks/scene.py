@@ -30,7 +30,7 @@ from extrap_train.tasks.scene_inputs import SceneInputs, fabric_of, open_inputs,
 from extrap_train.views import View, stack_cameras
 
 
-def run(config: TrainConfig) -> None:
+def run(config: TrainConfig) -> Path:
     """Train an adapter for `minutes` and leave it with its numbers and pictures behind.
 
     What the input views leave over of the scene is held out: the model is measured there with and
@@ -48,7 +48,7 @@ def run(config: TrainConfig) -> None:
     asked = _asked(config, inputs)
     if config.resume and _is_done(folder, asked):
         console.print(f"already adapted with these options: {folder}")
-        return
+        return folder
     targets = _targets(config, inputs, model)
     before = _generate(model, config, inputs, targets, fabric)
     adapter = add_adapter(model, config.lora, config.seed)
@@ -75,6 +75,7 @@ def run(config: TrainConfig) -> None:
     _write(folder, asked, done, pairs, measured, missing)
     console.print(_said(done, measured))
     console.print(f"result: {folder}")
+    return folder
 
 
 def _asked(config: TrainConfig, inputs: SceneInputs) -> dict[str, Any]:

@@ -1,0 +1,102 @@
+"""A sweep ends with a row for every job, whatever became of it."""
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from extrap_train.__main__ import main
+from extrap_train.config import TrainConfig
+from extrap_train.errors import InputError
+from extrap_train.sweep import add_row, read_rows
+
+Fake = Callable[[TrainConfig], Path]
+
+
+def _trained(tmp_path: Path) -> Fake:
+    """A task that has learnt as much as it was given steps, and never any cups."""
+
+    def run(config: TrainConfig) -> Path:
+        if config.category.name == "cup":
+            raise InputError("no training pairs for cup: loosen prep")
+        folder = tmp_path / f"{config.category.name}-{config.trainer.steps}"
+        folder.mkdir()
+        psnr = 20.0 + config.trainer.steps
+        scores = {"model": {"psnr": psnr, "lpips": None}, "nearest": {"psnr": 15.0}}
+        summary = {"validation": scores, "seconds": {"train": 3.0}, "provenance": {"seed": 0}}
+        (folder / "summary.json").write_text(json.dumps(summary))
+        return folder
+
+    return run
+
+
+def _sweep(monkeypatch: pytest.MonkeyPatch, task: Fake, folder: Path, *words: str) -> str | None:
+    """Run it; what it ends with, None where that is success."""
+    monkeypatch.setattr("extrap_train.__main__.task", lambda name: task)
+    monkeypatch.setattr(sys, "argv", ["extrap_train", "-m", *words, f"hydra.sweep.dir={folder}"])
+    try:
+        main()
+    except SystemExit as stopped:
+        return str(stopped)
+    return None
+
+
+def test_every_job_is_a_row_with_its_overrides_and_metrics(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    words = ["category=apple,book", "trainer.steps=1,2", "model.weight_decay=0"]
+    assert _sweep(monkeypatch, _trained(tmp_path), tmp_path / "sweep", *words) is None
+    table = pd.read_csv(tmp_path / "sweep" / "sweep.csv")
+    assert list(table.columns) == [
+        "job", "status", "seconds", "category", "trainer.steps", "model.weight_decay",
+        "result.validation.model.psnr", "result.validation.nearest.psnr", "reason",
+    ]  # fmt: skip
+    assert list(table["category"]) == ["apple", "apple", "book", "book"]
+    assert list(table["result.validation.model.psnr"]) == [21.0, 22.0, 21.0, 22.0]
+    assert (table["status"] == "ok").all()
+    assert (tmp_path / "sweep" / "sweep.png").stat().st_size > 1000
+    assert capfd.readouterr().out.splitlines()[-1].endswith("sweep/sweep.csv")
+
+
+def test_a_failed_job_is_a_row_and_the_others_go_on(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    words = ["category=apple,cup,book"]
+    said = _sweep(monkeypatch, _trained(tmp_path), tmp_path / "sweep", *words)
+    assert said == "error: no training pairs for cup: loosen prep"
+    table = pd.read_csv(tmp_path / "sweep" / "sweep.csv").set_index("category")
+    assert dict(table["status"]) == {"apple": "ok", "cup": "failed", "book": "ok"}
+    assert table["reason"]["cup"] == "InputError: no training pairs for cup: loosen prep"
+    assert pd.isna(table["result.validation.model.psnr"]["cup"])
+
+
+def test_an_option_out_of_bounds_fails_its_job_alone(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    words = ["category=apple", "trainer.steps=0,3"]
+    said = _sweep(monkeypatch, _trained(tmp_path), tmp_path / "sweep", *words)
+    assert said == "error: trainer.steps=0: must be at least 1"
+    table = pd.read_csv(tmp_path / "sweep" / "sweep.csv")
+    assert list(table["status"]) == ["failed", "ok"]
+
+
+def test_a_row_that_comes_late_or_twice_has_its_place(tmp_path: Path) -> None:
+    """Launchers that run jobs side by side end them in any order."""
+    file = tmp_path / "sweep.csv"
+    for number, lr in (("10", "3"), ("2", "1"), ("10", "4")):
+        rows = add_row(
+            file, {"job": number, "status": "ok", "seconds": "1.0", "lr": lr, "reason": ""}
+        )
+    assert [(row["job"], row["lr"]) for row in rows] == [("2", "1"), ("10", "4")]
+    assert read_rows(file) == rows
+
+
+def test_a_single_run_has_no_table(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("extrap_train.__main__.task", lambda name: _trained(tmp_path))
+    monkeypatch.setattr(sys, "argv", ["extrap_train", "category=apple"])
+    main()
+    assert not list(tmp_path.rglob("sweep.csv"))
