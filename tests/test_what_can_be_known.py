@@ -50,7 +50,7 @@ def _decibels(image: Float[Tensor, "b 3 h w"], truth: Float[Tensor, "b 3 h w"]) 
 
 
 @pytest.mark.slow
-def test_perfect_but_for_the_unseen_surroundings_little_is_gained(
+def test_objects_and_grounds_leave_a_model_room_above_the_baselines(
     tmp_path: Path,
 ) -> None:
     batch, is_object, is_far = _held_out(tmp_path)
@@ -72,10 +72,9 @@ def test_perfect_but_for_the_unseen_surroundings_little_is_gained(
     )
     share = float((unseen & is_far).float().mean())
     print(f"\nunseen surroundings: {share:.0%} of the pixels")
-    assert share > 0.25
     for name, decibels in reached.items():
         print(f"an oracle that knows {name}: {decibels:.2f} dB")
     baseline = reached["nothing: the warp, holes in the mean colour"]
     assert baseline < reached["what the warp shows"] < reached["all but the unseen surroundings"]
-    # With the mean colour where no warp reaches, even a method perfect elsewhere gains this little.
-    assert reached["all but the unseen surroundings"] - baseline < 2
+    # Else the comparison would be about guessing where unseen houses stand.
+    assert reached["all but the unseen surroundings"] - baseline > 2.5
