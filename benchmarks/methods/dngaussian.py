@@ -24,6 +24,8 @@ from extrap_train.views import Camera
 
 _OPAQUE = 0.2
 """Opacities above are pulled to 1, those below, as in the released code, too."""
+_REMEMBERED = 0.6
+"""Share of the running mean that stays when another hard loss comes in."""
 
 
 @dataclass(frozen=True)
@@ -52,10 +54,15 @@ class DnGaussian(GaussianMethod):
     """Where monocular depth comes from: `surrogate` or `depth_source`."""
     hard_opacity: float = 0.95
     soft_from: int = 1000
+    soft_below: float = 0.1
+    """Soft steps are taken only while the running mean of the hard loss is below (DTU): opacities
+    have nothing to learn from depth before means have.
+    """
     smooth_from: int = 3000
     local_weight: float = 0.1
     global_weight: float = 1.0
-    smooth_weight: float = 0.1
+    smooth_weight: float = 0.0
+    """Of edge-aware smoothness. Published: 0.1 for LLFF, none for DTU."""
     depth_tolerance: float = 0.01
     patch_range: tuple[int, int] = (5, 17)
     """Least and greatest side of a patch in pixels; each term draws its own."""
@@ -102,6 +109,8 @@ class DnGaussianRecipe(Recipe):
                     )
                 )
         scene.record["color"] = options.color
+        self._hard_loss = 1.0  # of depth that has nothing to do with the prior, about
+        self._soft_steps = 0
 
     def modules(self) -> Sequence[tuple[nn.Module, float, float]]:
         """The grid and the networks, at rates that stay."""
@@ -123,9 +132,11 @@ class DnGaussianRecipe(Recipe):
         return self._neural(means, directions)
 
     def steps(self, training: Training) -> Sequence[Step]:
-        """Hard depth, later soft depth, and the photograph."""
+        """Hard depth, once that is near its prior soft depth, and the photograph."""
         late = training.iteration > training.schedule.at(self.options.soft_from)
-        soft = (self._soft_step,) if late else ()
+        soft = (self._soft_step,) if late and self._hard_loss < self.options.soft_below else ()
+        self._soft_steps += len(soft)
+        self.scene.record["soft depth"] = f"in {self._soft_steps} iterations"
         return (self._hard_step, *soft, self.photometric_step)
 
     def regulariser(
@@ -147,7 +158,9 @@ class DnGaussianRecipe(Recipe):
         now = training.optimiser.parameters.gaussians()
         opaque = torch.full_like(now.opacities, self.options.hard_opacity)
         shown = replace(now, opacities=opaque, scales=now.scales.detach(), quats=now.quats.detach())
-        return Objective(self._depth_loss(training, index, shown))
+        loss = self._depth_loss(training, index, shown)
+        self._hard_loss = _REMEMBERED * self._hard_loss + (1 - _REMEMBERED) * float(loss.detach())
+        return Objective(loss)
 
     def _soft_step(self, training: Training, index: int) -> Objective:
         now = training.optimiser.parameters.gaussians()
@@ -173,6 +186,7 @@ class DnGaussianRecipe(Recipe):
             drawn = torch.randint(least, greatest + 1, (1,), generator=training.generator)
             term = patch_depth_loss(depth, prior, int(drawn), local, options.depth_tolerance)
             loss = loss + weight * term
-        if training.iteration > training.schedule.at(options.smooth_from):
+        late = training.iteration > training.schedule.at(options.smooth_from)
+        if late and options.smooth_weight > 0:
             loss = loss + options.smooth_weight * edge_aware_smoothness(depth, prior)
         return loss

@@ -151,6 +151,13 @@ def test_growth_adds_gaussians_where_it_may() -> None:
     assert eager.synthesize(inputs).counts["gaussians"] > 250
 
 
+@pytest.mark.parametrize(("below", "said"), [(0.0, "in 0 iterations"), (9.0, "in 10 iterations")])
+def test_dngaussian_waits_with_soft_depth_until_hard_depth_is_near(below: float, said: str) -> None:
+    inputs, _ = scene_inputs(size=16)
+    method = replace(METHODS["dngaussian"], iterations=12, soft_below=below)
+    assert method.fitted(inputs).record["soft depth"] == said  # from a sixth of the training on
+
+
 def test_given_points_are_where_training_starts() -> None:
     inputs, _ = scene_inputs(size=16)
     options = GaussianOptions(iterations=1, sh_degree=0)
