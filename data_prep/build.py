@@ -48,7 +48,7 @@ class _Plan:
         """A hash of all of it."""
         test = self.test_names if isinstance(self.test_names, int) else sorted(self.test_names)
         shop = self.workshop
-        how = [asdict(shop.options), test, repr(shop.matcher)]
+        how = [asdict(shop.options), test, shop.correction]
         digest = hashlib.sha256(json.dumps([FORMAT, *how]).encode())
         for sequence in self.sequences:
             qualities = [sequence.viewpoint_quality, sequence.point_cloud_quality]

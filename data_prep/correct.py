@@ -6,6 +6,7 @@ its points moved by it. A correction must prove itself: where neither the pictur
 the truth nor the matches to where they belong, the warp stays as it is.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -13,17 +14,24 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from extrap_train.geometry.flow import fit_flow, flow_at
+from extrap_train.geometry.flow import fit_flow, flow_at, least_squares_flow
 from extrap_train.geometry.warp import warp_references
 from extrap_train.matching import Matcher
 from extrap_train.views import Camera, Warp, stack_cameras
 
+METHOD = 2
+"""Raised whenever the same frames give other corrections, so that old ones are made anew."""
 LEAST_MATCHES = 40
 """Fewer do not tell a smooth motion from chance."""
 LEAST_INLIERS = 0.5
 """Share of the matches that a smooth motion must explain."""
-LEAST_GAIN = 0.05
-"""Share of the photometric error that a correction must take away: exact depths are not moved."""
+LEAST_STEP = 0.1
+"""Pixels that the matches must move by, in the median: a matcher knows no less, and exact depths
+are not to be moved."""
+LEAST_GAIN = 0.01
+"""Share of the photometric error that a correction must take away; less is chance."""
+STIFFER = (1e-4, 1e-3)
+"""Also tried in place of `flow.STIFFNESS`: noise in the depths shakes a field that bends easily."""
 MOST_MATCHES = 2000
 """A smooth field needs no more."""
 
@@ -54,7 +62,7 @@ def correct_pair(
 
     `grid` is the number of control points along each side of the flow.
     """
-    before = _warp(image, depth, reference, query)
+    before = draw(image, depth, reference, query)
     error_before = photometric_error(before, truth)
     matches = matcher.match(before.image[0], truth, before.mask[0] > 0)
     if len(matches) < LEAST_MATCHES:
@@ -68,24 +76,48 @@ def correct_pair(
     if share < LEAST_INLIERS:
         reason = f"{share:.0%} of the matches move together"
         return Correction(None, error_before, error_before, reason)
-    if not _explains(flow, positions[inliers], steps[inliers]):
+    positions, steps, weights = positions[inliers], steps[inliers], matches.confidence[inliers]
+    if not _explains(flow, positions, steps):
         return Correction(None, error_before, error_before, "the matches have no motion in common")
+    if float((steps * size / 2).norm(dim=1).median()) < LEAST_STEP:
+        return Correction(None, error_before, error_before, "the matches hardly move")
+    flows = [flow, *(least_squares_flow(positions, steps, weights, grid, s) for s in STIFFER)]
+    tried = [_tried(before, image, depth, reference, truth, query, flow) for flow in flows]
+    best = max(tried, key=_gain)
+    if not _gain(best) >= LEAST_GAIN:
+        return Correction(None, error_before, error_before, "the picture comes no closer")
+    return best
+
+
+def _tried(
+    before: Warp,
+    image: Float[Tensor, "3 h w"],
+    depth: Float[Tensor, "h w"],
+    reference: Camera,
+    truth: Float[Tensor, "3 h w"],
+    query: Camera,
+    flow: Float[Tensor, "2 g g"],
+) -> Correction:
     # As it is stored, so that what is judged is what training draws.
     flow = flow.half().float()
-    after = _warp(image, depth, reference, query, flow)
-    error_before, error_after = errors_in_common(before, after, truth)
-    if not error_after <= error_before * (1 - LEAST_GAIN):
-        return Correction(None, error_before, error_before, "the picture comes no closer")
-    return Correction(flow, error_before, error_after)
+    after = draw(image, depth, reference, query, flow)
+    return Correction(flow, *errors_in_common(before, after, truth))
 
 
-def _warp(
+def _gain(correction: Correction) -> float:
+    """Share of the error that a correction takes away; −1 where nothing can be compared."""
+    gain = 1 - correction.error_after / max(correction.error_before, 1e-12)
+    return gain if math.isfinite(gain) else -1.0
+
+
+def draw(
     image: Float[Tensor, "3 h w"],
     depth: Float[Tensor, "h w"],
     reference: Camera,
     query: Camera,
     flow: Float[Tensor, "2 g g"] | None = None,
 ) -> Warp:
+    """The warp of one reference, its points moved by `flow`."""
     return warp_references(
         image[None, None],
         depth[None, None],

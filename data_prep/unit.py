@@ -10,6 +10,7 @@ import logging
 from dataclasses import dataclass
 from pathlib import Path
 
+from data_prep.correct import METHOD
 from data_prep.frames import frames_key, make_frames
 from data_prep.pairs import PairFiles, make_pairs
 from extrap_train.config import PrepConfig
@@ -42,6 +43,11 @@ class Workshop:
     folder: Path
     """Root of the pairs."""
 
+    @property
+    def correction(self) -> str:
+        """How warps are corrected; empty where they are not."""
+        return "" if self.matcher is None else f"{self.matcher!r}, method {METHOD}"
+
 
 @dataclass(frozen=True)
 class Unit:
@@ -72,8 +78,8 @@ class Unit:
     def pair_files(self) -> PairFiles:
         """Where the pairs lie, and what they are made from."""
         shop = self.workshop
-        how = "" if shop.matcher is None else repr(shop.matcher)
-        return PairFiles.of(shop.folder, self.name, self.frames_key, self.role, shop.options, how)
+        made_from = (self.frames_key, self.role, shop.options, shop.correction)
+        return PairFiles.of(shop.folder, self.name, *made_from)
 
 
 def prepare_unit(unit: Unit) -> str:

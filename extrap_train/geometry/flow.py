@@ -64,10 +64,9 @@ def fit_flow(
     """
     if not len(positions):
         raise ValueError("no displacements to fit a field to")
-    across, down = (bspline_basis(p.double(), grid) for p in positions.unbind(-1))
-    design = torch.einsum("ni,nj->nij", down, across).flatten(1)
+    design = _design(positions, grid)
     target, base = displacements.double(), weights.double()
-    bending = _second_differences(grid).to(design)
+    bending = STIFFNESS * _second_differences(grid).to(design)
     robust = base
     for _ in range(ROUNDS):
         field = _solve(design, target, robust, bending)
@@ -85,6 +84,26 @@ def fit_flow(
     return field.T.reshape(2, grid, grid).to(displacements), inliers
 
 
+def least_squares_flow(
+    positions: Float[Tensor, "n 2"],
+    displacements: Float[Tensor, "n 2"],
+    weights: Float[Tensor, "n"],
+    grid: int,
+    stiffness: float,
+) -> Float[Tensor, "2 g g"]:
+    """The field nearest to all of the displacements, as stiff as is asked for."""
+    design = _design(positions, grid)
+    bending = stiffness * _second_differences(grid).to(design)
+    field = _solve(design, displacements.double(), weights.double(), bending)
+    return field.T.reshape(2, grid, grid).to(displacements)
+
+
+def _design(positions: Float[Tensor, "n 2"], grid: int) -> Float[Tensor, "n m"]:
+    """Every control point's share of the field at each position."""
+    across, down = (bspline_basis(p.double(), grid) for p in positions.unbind(-1))
+    return torch.einsum("ni,nj->nij", down, across).flatten(1)
+
+
 def _solve(
     design: Float[Tensor, "n m"],
     target: Float[Tensor, "n 2"],
@@ -93,7 +112,7 @@ def _solve(
 ) -> Float[Tensor, "m 2"]:
     """Weighted least squares; the weights' sum stands for the number of matches."""
     weighted = design * (weights / weights.sum())[:, None]
-    normal = weighted.mT @ design + STIFFNESS * bending
+    normal = weighted.mT @ design + bending
     # Where neither matches nor stiffness decide (a plane through nothing), the smallest field.
     floor = 1e-9 * torch.eye(len(bending), dtype=normal.dtype)
     return torch.linalg.solve(normal + floor, weighted.mT @ target)

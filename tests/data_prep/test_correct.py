@@ -81,6 +81,32 @@ def test_misalignment_falls_and_never_rises(scene: Scene) -> None:
     assert np.median(after) <= 0.4 * np.median(before)
 
 
+@pytest.mark.parametrize("scene", [SPHERE_ON_PLANE, BOX_AND_PLANE], ids=["sphere", "box"])
+@pytest.mark.parametrize(
+    ("amount", "noise"), [(0, 0), (0.0025, 0.001), (0.01, 0.001), (0.05, 0.01)]
+)
+def test_no_pair_gets_worse_however_small_or_noisy_the_error(
+    scene: Scene, amount: float, noise: float
+) -> None:
+    moved = 0
+    for seed, (first, second) in enumerate([(0, 12), (40, 60), (300, 255), (10, 70)]):
+        reference, query = (orbit_camera(azimuth, size=SIZE) for azimuth in (first, second))
+        image, truth = speckled(scene, reference), speckled(scene, query)
+        factors = smooth_error(seed, amount, noise) if noise else torch.ones(SIZE, SIZE)
+        depth = scene.depth(reference) * factors
+        found = correct_pair(image, depth, reference, truth, query, FLOW, GRID)
+        if found.flow is None:
+            continue
+        moved += 1
+        assert found.error_after < found.error_before
+        before, after = (
+            misalignment(drawn(image, depth, reference, query, flow), scene, reference, query)
+            for flow in (None, found.flow)
+        )
+        assert after <= before
+    assert moved == 4 or amount < 0.05
+
+
 def test_exact_depth_is_left_alone_or_hardly_moved() -> None:
     reference, query = orbit_camera(0, size=SIZE), orbit_camera(20, size=SIZE)
     image, truth = (speckled(SPHERE_ON_PLANE, camera) for camera in (reference, query))
