@@ -68,7 +68,11 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--dry-run", action="store_true", help="what would run, and how long")
     where = run.add_mutually_exclusive_group()
     where.add_argument("--workers", type=_positive, default=0, metavar="N", help="default: cores")
-    where.add_argument("--slurm", action="store_true", help="as a SLURM job array")
+    where.add_argument(
+        "--slurm",
+        action="store_true",
+        help="as a SLURM job array; slurm.partition=NAME and the like",
+    )
     report = command("report", _report, "write a table's reports again")
     with_table(report)
     report.add_argument("--format", choices=FORMATS, help="default: all")

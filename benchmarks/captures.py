@@ -30,11 +30,20 @@ CLOUD_POINTS = 20_000
 
 
 @dataclass(frozen=True)
+class TrueSurface:
+    """Points of what a capture shows, in world units."""
+
+    object: Float[Tensor, "m 3"]
+    surroundings: Float[Tensor, "k 3"]
+    """Ground and the like: not asked for, and no error."""
+
+
+@dataclass(frozen=True)
 class Capture:
     """A test capture, and its true surface where that is known."""
 
     sequence: Sequence
-    cloud: Callable[[], Float[Tensor, "m 3"]] | None = None
+    surface: Callable[[], TrueSurface] | None = None
 
 
 def open_captures(config: CapturesConfig, categories: list[str]) -> list[Capture]:
@@ -77,18 +86,20 @@ def freeze(config: CapturesConfig, rules: RulesConfig, captures: list[Capture]) 
 def _synthetic(config: CapturesConfig, category: str, index: int) -> Capture:
     options = SyntheticConfig(frames=config.frames, image_size=config.render_size, seed=config.seed)
 
-    def cloud() -> Float[Tensor, "m 3"]:
-        scene = build_scene(category, index, config.seed)
-        return torch.from_numpy(surface_points(scene, CLOUD_POINTS).points).float()
+    def surface() -> TrueSurface:
+        found = surface_points(build_scene(category, index, config.seed), CLOUD_POINTS)
+        points = torch.from_numpy(found.points).float()
+        is_object = torch.from_numpy(found.is_object)
+        return TrueSurface(points[is_object], points[~is_object])
 
-    return Capture(synthetic_sequence(category, index, options), cloud)
+    return Capture(synthetic_sequence(category, index, options), surface)
 
 
 def _with_cloud(sequence: Sequence) -> Capture:
     cloud = sequence.point_cloud
     if cloud is None or not cloud.is_file():
         return Capture(sequence)
-    return Capture(sequence, lambda: read_points(cloud))
+    return Capture(sequence, lambda: TrueSurface(read_points(cloud), torch.zeros(0, 3)))
 
 
 def _co3d(config: CapturesConfig, category: str) -> list[Sequence]:

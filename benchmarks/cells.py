@@ -26,8 +26,8 @@ from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis, Unavailab
 from benchmarks.methods.build import build_method
 from benchmarks.provenance import versions
 from benchmarks.recorded_depth import RecordedDepth
-from benchmarks.scenes import Scene, png_bytes
-from benchmarks.scoring import Score, score_images
+from benchmarks.scenes import Scene, Truth, npy_bytes, png_bytes
+from benchmarks.scoring import Score, score_images, score_points
 from extrap_train.config import MethodConfig, ScoringConfig
 from extrap_train.data.files import write_whole
 from extrap_train.data.json_files import read_json
@@ -63,13 +63,14 @@ def run_cell(job: CellJob) -> dict[str, Any]:
     scene = Scene.open(job.scene)
     record = _head(job, scene)
     pictures: dict[str, bytes] = {}
+    points: dict[str, bytes] = {}
     try:
-        made, pictures = _made(job, scene)
-        images = read_images_from(pictures)
+        made, pictures, points = _made(job, scene)
         record |= {"status": OK, "reason": "", **made}
-        scores = score_images(images, scene.truth(), job.scoring)
+        scores = score_cell(pictures, points, scene.truth(), job.scoring)
         record["metrics"] = {name: asdict(score) for name, score in scores.items()}
         record["images"] = {name: hashlib.sha256(c).hexdigest() for name, c in pictures.items()}
+        record["points"] = {name: hashlib.sha256(c).hexdigest() for name, c in points.items()}
     except Unavailable as error:
         record |= {"status": UNAVAILABLE, "reason": str(error)}
     except Exception as error:
@@ -78,10 +79,22 @@ def run_cell(job: CellJob) -> dict[str, Any]:
             "reason": f"{type(error).__name__}: {' '.join(str(error).split())[:300]}",
             "traceback": traceback.format_exc(),
         }
-    if record["status"] != OK:
-        pictures = {}
-    write_cell(job.folder, record, pictures)
+    write_cell(job.folder, record, pictures | points if record["status"] == OK else {})
     return record
+
+
+def score_cell(
+    pictures: Mapping[str, bytes], points: Mapping[str, bytes], truth: Truth, scoring: ScoringConfig
+) -> dict[str, Score]:
+    """Every metric of a cell from its files."""
+    images = score_images(read_images_from(pictures), truth, scoring)
+    clouds = [torch.from_numpy(np.load(io.BytesIO(content))) for content in points.values()]
+    return images | score_points(clouds[0] if clouds else None, truth)
+
+
+def read_cell_files(folder: Path, record: Mapping[str, Any], kind: str) -> dict[str, bytes]:
+    """The `images` or `points` of a finished cell."""
+    return {name: (folder / name).read_bytes() for name in record.get(kind, {})}
 
 
 def died_record(job: CellJob, reason: str) -> dict[str, Any]:
@@ -106,13 +119,17 @@ def _head(job: CellJob, scene: Scene) -> dict[str, Any]:
     }
 
 
-def _made(job: CellJob, scene: Scene) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """The images as files, and what was measured while they were made."""
+def _made(job: CellJob, scene: Scene) -> tuple[dict[str, Any], dict[str, bytes], dict[str, bytes]]:
+    """What was measured while the images were made, the images as files, and the points as one,
+    where the method has any.
+    """
     if job.images_from is not None:
         before = read_json(job.images_from / "cell.json")
         kept = ("seconds", "wall_seconds", "peak_memory_mib", "given", "counts")
-        pictures = {name: (job.images_from / name).read_bytes() for name in before["images"]}
-        return {name: before[name] for name in kept}, pictures
+        pictures, points = (
+            read_cell_files(job.images_from, before, kind) for kind in ("images", "points")
+        )
+        return {name: before[name] for name in kept}, pictures, points
     inputs = scene.inputs()
     with PeakMemory() as memory, Stopwatch() as watch:
         synthesis = _synthesize(job, inputs)
@@ -124,7 +141,8 @@ def _made(job: CellJob, scene: Scene) -> tuple[dict[str, Any], dict[str, bytes]]
         "given": dict(synthesis.given),
         "counts": dict(synthesis.counts),
     }
-    return made, pictures
+    points = {} if synthesis.points is None else {"points.npy": npy_bytes(synthesis.points)}
+    return made, pictures, points
 
 
 def _synthesize(job: CellJob, inputs: SceneInputs) -> Synthesis:
@@ -155,15 +173,15 @@ def read_images_from(pictures: Mapping[str, bytes]) -> Float[Tensor, "n 3 h w"]:
 
 def read_cell_images(folder: Path, record: Mapping[str, Any]) -> Float[Tensor, "n 3 h w"]:
     """The saved images of a finished cell, in the targets' order."""
-    return read_images_from({name: (folder / name).read_bytes() for name in record["images"]})
+    return read_images_from(read_cell_files(folder, record, "images"))
 
 
-def write_cell(folder: Path, record: Mapping[str, Any], pictures: Mapping[str, bytes]) -> None:
+def write_cell(folder: Path, record: Mapping[str, Any], files: Mapping[str, bytes]) -> None:
     """Write beside the final place and rename; what stood there (a failed cell) goes."""
     workshop = folder.with_name(f".{folder.name}.{os.getpid()}")
     shutil.rmtree(workshop, ignore_errors=True)
     try:
-        for name, content in pictures.items():
+        for name, content in files.items():
             write_whole(workshop / name, content)
         write_whole(workshop / "cell.json", json_bytes(record))
         shutil.rmtree(folder, ignore_errors=True)
@@ -179,7 +197,7 @@ def read_cell(folder: Path) -> dict[str, Any] | None:
     record = read_json(folder / "cell.json")
     if not isinstance(record, dict) or record.get("key") != folder.name or "status" not in record:
         raise InputError(f"{folder / 'cell.json'}: is no record of this cell")
-    for name, stated in record.get("images", {}).items():
+    for name, stated in (record.get("images", {}) | record.get("points", {})).items():
         file = folder / name
         if not file.is_file() or hashlib.sha256(file.read_bytes()).hexdigest() != stated:
             raise InputError(f"{file}: is missing, or not what its cell's hash says")

@@ -34,7 +34,7 @@ def direction(metric: str) -> int:
     """1 where higher is better, -1 where lower is, 0 where neither (a property of the draw)."""
     if metric in HIGHER_IS_BETTER:
         return 1
-    return -1 if metric in LOWER_IS_BETTER or metric.startswith("lpips_") else 0
+    return -1 if metric in LOWER_IS_BETTER or metric.startswith("lpips") else 0
 
 
 @dataclass(frozen=True)

@@ -174,7 +174,7 @@ def _make(
         return problems
     started = time.perf_counter()
     with (
-        _launcher(options, waiting[0].device, folder) as launcher,
+        _launcher(options, table.slurm, waiting[0].device, folder) as launcher,
         Live(progress.view(len(waiting), 0.0, 0), console=console) as live,
     ):
         for number, (index, result) in enumerate(launcher.run(run_cell, waiting), 1):
@@ -189,11 +189,13 @@ def _make(
 
 
 @contextmanager
-def _launcher(options: RunOptions, device: str, folder: TableFolder) -> Iterator[Launcher]:
+def _launcher(
+    options: RunOptions, slurm: SlurmConfig, device: str, folder: TableFolder
+) -> Iterator[Launcher]:
     if options.launcher is not None:
         yield options.launcher
     elif options.slurm:
-        yield slurm_launcher(SlurmConfig(), folder.path / "slurm")
+        yield slurm_launcher(slurm, folder.path / "slurm")
     else:
         cores = 1 if device == "cuda" else len(os.sched_getaffinity(0))
         with LocalLauncher(options.workers or cores, apart=True) as local:

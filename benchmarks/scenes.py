@@ -3,7 +3,8 @@
 <folder>/scene.json            the draw, cameras, angles, hashes; written last
          inputs/0.png …        inputs/depth.npy (0 = unknown; found from the inputs alone), at
                                the finer size
-         truth/0.png …         truth/depth.npy and truth/cloud.npy where the capture knows them
+         truth/0.png …         truth/depth.npy, truth/object.npy and truth/surroundings.npy (points)
+                               where the capture knows them
          warps/0.png …         masks/0.png …: the fused warp of all inputs, and what it reaches
 """
 
@@ -23,7 +24,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from benchmarks.captures import Capture
+from benchmarks.captures import Capture, TrueSurface
 from benchmarks.files import json_bytes
 from benchmarks.methods.base import SceneInputs, Stopwatch
 from benchmarks.protocol import Draw, digest, draw_of
@@ -54,7 +55,7 @@ class Truth:
     masks: Float[Tensor, "n h w"]
     """1 where that warp reaches, else 0."""
     depths: Float[Tensor, "n h w"] | None
-    cloud: Float[Tensor, "m 3"] | None
+    surface: TrueSurface | None
 
 
 @dataclass(frozen=True)
@@ -124,8 +125,12 @@ class Scene:
             warps=self._pictures("warps", count),
             masks=(self._pictures("masks", count)[:, 0] > 0.5).float(),
             depths=self._array("truth/depth.npy"),
-            cloud=self._array("truth/cloud.npy"),
+            surface=self._surface(),
         )
+
+    def _surface(self) -> TrueSurface | None:
+        found = [self._array(f"truth/{name}.npy") for name in ("object", "surroundings")]
+        return None if found[0] is None or found[1] is None else TrueSurface(found[0], found[1])
 
     def _pictures(self, kind: str, count: int, side: int | None = None) -> Float[Tensor, "n 3 h w"]:
         size = (side or self.record["image_size"],) * 2
@@ -199,12 +204,14 @@ def _write_scene(folder: Path, capture: Capture, draw: Draw, rules: RulesConfig)
         for kind, images in pictures.items()
         for i, image in enumerate(images)
     }
-    contents["inputs/depth.npy"] = _npy_bytes(torch.stack(depths))
+    contents["inputs/depth.npy"] = npy_bytes(torch.stack(depths))
     known = [view.depth for view in targets if view.depth is not None]
     if len(known) == len(targets):
-        contents["truth/depth.npy"] = _npy_bytes(torch.stack(known))
-    if capture.cloud is not None:
-        contents["truth/cloud.npy"] = _npy_bytes(capture.cloud())
+        contents["truth/depth.npy"] = npy_bytes(torch.stack(known))
+    if capture.surface is not None:
+        surface = capture.surface()
+        contents["truth/object.npy"] = npy_bytes(surface.object)
+        contents["truth/surroundings.npy"] = npy_bytes(surface.surroundings)
     for name, content in contents.items():
         write_whole(folder / name, content)
     return {
@@ -265,7 +272,8 @@ def png_bytes(image: Float[Tensor, "3 h w"]) -> bytes:
     return content.getvalue()
 
 
-def _npy_bytes(values: Tensor) -> bytes:
+def npy_bytes(values: Tensor) -> bytes:
+    """An array in single precision."""
     content = io.BytesIO()
     np.save(content, values.float().numpy())
     return content.getvalue()

@@ -25,7 +25,10 @@ from extrap_train.metrics import (
     require_unit_range,
     ssim,
 )
+from extrap_train.reconstruction.cloud_metrics import TOLERANCE, score_cloud
 
+_NO_POINTS = "the method gives no geometry"
+_NO_SURFACE = "the capture's true surface is not known"
 _NO_DEPTH = "the capture has no true depth"
 _ALL_SEEN = "the inputs reach every pixel of every target"
 _NONE_SEEN = "the inputs reach no pixel of any target"
@@ -64,6 +67,27 @@ def score_images(
         | megascenes_compat(images, truth)
         | _consistency(images, truth)
     )
+
+
+def score_points(points: Float[Tensor, "m 3"] | None, truth: Truth) -> dict[str, Score]:
+    """How well a method's points lie on the object, and how much of it they show (in its box).
+
+    Shares within 2 % of the object's largest side; `accuracy_distance` is the points' mean distance
+    to the true surface as a share of that side.
+    """
+    names = ("accuracy_share", "completeness", "f_score", "accuracy_distance")
+    if points is None or truth.surface is None:
+        reason = _NO_POINTS if points is None else _NO_SURFACE
+        return {name: Score(None, reason) for name in names}
+    target = truth.surface.object.double().numpy()
+    size = float((target.max(0) - target.min(0)).max())
+    around = truth.surface.surroundings.double().numpy()
+    found = score_cloud(points.double().numpy(), target, around, TOLERANCE * size)
+    values = (found.accuracy, found.completeness, found.f_score, found.mean_to_truth / size)
+    return {
+        name: Score(value) if math.isfinite(value) else Score(None, "no point is near the object")
+        for name, value in zip(names, values, strict=True)
+    }
 
 
 def _of_images(values: Float[Tensor, " n"], reason: str) -> Score:

@@ -4,12 +4,12 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
-from benchmarks.cells import OK, read_cell_images, scores_of
+from benchmarks.cells import OK, read_cell_files, score_cell, scores_of
 from benchmarks.plan import TableFolder
 from benchmarks.protocol import Protocol
 from benchmarks.results import Results, read_results
 from benchmarks.scenes import Scene
-from benchmarks.scoring import Score, score_images
+from benchmarks.scoring import Score
 from extrap_train.config import ScoringConfig
 from extrap_train.errors import InputError
 
@@ -49,9 +49,12 @@ def _problems(results: Results, cell: dict[str, Any]) -> Iterator[str]:
     if scene.data_hash != cell["hashes"]["data"]:
         yield f"{scene.folder} holds other data than the cell was made from"
         return
-    images = read_cell_images(results.folder.cells / cell["key"], cell)
+    files = (
+        read_cell_files(results.folder.cells / cell["key"], cell, kind)
+        for kind in ("images", "points")
+    )
     scoring = ScoringConfig(**results.plan["table"]["scoring"])
-    again = score_images(images, scene.truth(), scoring)
+    again = score_cell(*files, scene.truth(), scoring)
     for name, stated in scores_of(cell).items():
         found = again.get(name, Score(None, "the metric is not known any more"))
         if not _same(stated.value, found.value):

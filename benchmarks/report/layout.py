@@ -23,6 +23,10 @@ NAMES = {
     "compat_ssim": "MegaScenes' SSIM",
     "tsed": "TSED",
     "warp_psnr": "warp PSNR",
+    "accuracy_share": "accuracy",
+    "completeness": "completeness",
+    "f_score": "F-score",
+    "accuracy_distance": "distance",
     "seconds": "time, s",
     "lpips": "LPIPS",
 }
@@ -94,8 +98,9 @@ def lay_out(results: Results, reported: dict[str, Any] | None) -> Layout:
         for draw in dict.fromkeys(cell["draw"] for cell in results.cells):
             title = f"{category or table['title'] or table['name']}, {draw} inputs"
             panels.append(_panel(title, results, means[means["draw"] == draw], category, draw))
+    quick = " (quick: a part of the table)" if results.plan["quick"] else ""
     return Layout(
-        title=table["title"] or table["name"],
+        title=(table["title"] or table["name"]) + quick,
         panels=panels,
         reported=None if reported is None else _reported(reported),
         missing=_missing(results),

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Any
 
+from extrap_train.config.launcher import SlurmConfig
 from extrap_train.config.tree import MISSING
 
 CAPTURE_SOURCES = ("synthetic", "co3d", "reconfusion", "scenes")
@@ -98,6 +99,8 @@ class TableConfig:
     output: str = "results"
     device: str = "auto"
     """`cpu`, `cuda`, or `auto`: CUDA where there is one."""
+    slurm: SlurmConfig = field(default_factory=SlurmConfig)
+    """Of `--slurm`: `slurm.partition=NAME slurm.hours=2`."""
 
 
 @dataclass

@@ -6,6 +6,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
+TOLERANCE = 0.02
+"""Usual tolerance of `score_cloud`, as a share of the object's largest side."""
+
 
 @dataclass(frozen=True)
 class CloudScores:

@@ -11,14 +11,17 @@ from extrap_train.data.synthetic import SyntheticScene, surface_points
 from extrap_train.geometry.viewpoints import directions_from, scene_center
 from extrap_train.metrics import psnr
 from extrap_train.reconstruction.cloud import PointCloud
-from extrap_train.reconstruction.cloud_metrics import CloudScores, score_cloud, sphere_coverage
+from extrap_train.reconstruction.cloud_metrics import (
+    TOLERANCE,
+    CloudScores,
+    score_cloud,
+    sphere_coverage,
+)
 from extrap_train.reconstruction.completion import Step
 from extrap_train.reconstruction.global_map import GENERATED, GlobalMap
 from extrap_train.reconstruction.inputs import WorldUnit
 from extrap_train.reconstruction.new_view import prior_of, scene_size
 
-TOLERANCE = 0.02
-"""Of the 3-D scores, as a share of the object's largest side."""
 TRUTH_POINTS = 60_000
 SEEN_WITHIN_RAD = np.radians(20)
 """A direction is covered if a view looks from less than this beside it."""

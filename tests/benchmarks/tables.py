@@ -5,6 +5,7 @@ from pathlib import Path
 from benchmarks.catalogue import Catalogue
 from benchmarks.plan import TableFolder
 from benchmarks.runner import RunOptions, run_table
+from extrap_train.jobs import Launcher
 from extrap_train.jobs.local import LocalLauncher
 
 _METHOD = '''
@@ -41,7 +42,8 @@ class Grey:
         size = (inputs.targets.height, inputs.targets.width)
         with Stopwatch() as watch:
             images = torch.full((count, 3, *size), self.level * self_range)
-        return Synthesis(images, watch.seconds, {"init": "none"}, counts={"greys": 1.0})
+        points = torch.zeros(5, 3) if self.trouble == "points" else None
+        return Synthesis(images, watch.seconds, {"init": "none"}, points, {"greys": 1.0})
 '''
 _TABLE = """
 title: Greys
@@ -64,6 +66,7 @@ reported: table1
 """
 METHODS = {"dark": (0.2, ""), "light": (0.6, ""), "broken": (0.5, "raise")}
 METHODS |= {"absent": (0.5, "unavailable"), "killer": (0.5, "kill"), "bright": (1.0, "range")}
+METHODS |= {"solid": (0.4, "points")}
 
 
 def write_own(folder: Path) -> Path:
@@ -80,11 +83,13 @@ def write_own(folder: Path) -> Path:
     return folder
 
 
-def run_greys(own: Path, output: Path, *overrides: str, **options: object) -> int:
-    """Run the table in this process."""
+def run_greys(
+    own: Path, output: Path, *overrides: str, launcher: Launcher | None = None, **options: object
+) -> int:
+    """Run the table, in this process unless there is a launcher."""
     catalogue = Catalogue.with_own([str(own)])
     table = catalogue.table("greys", [f"output={output}", *overrides])
-    run = RunOptions(launcher=LocalLauncher(1), **options)  # type: ignore[arg-type]
+    run = RunOptions(launcher=launcher or LocalLauncher(1), **options)  # type: ignore[arg-type]
     return run_table(table, catalogue, run)
 
 

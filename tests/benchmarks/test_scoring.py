@@ -8,8 +8,9 @@ import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio
 
+from benchmarks.captures import TrueSurface
 from benchmarks.scenes import Truth
-from benchmarks.scoring import megascenes_compat, score_images
+from benchmarks.scoring import megascenes_compat, score_images, score_points
 from extrap_train.config import ScoringConfig
 from extrap_train.views import stack_cameras
 from tests.benchmarks.analytic import view_at
@@ -29,7 +30,7 @@ def truth() -> Truth:
         warps=images * masks[:, None],
         masks=masks,
         depths=torch.stack([v.depth for v in views if v.depth is not None]),
-        cloud=None,
+        surface=None,
     )
 
 
@@ -98,3 +99,26 @@ def test_lpips_is_named_by_its_net(truth: Truth, shared: Path) -> None:
     weights = {"squeeze": str(shared / "weights" / "lpips_squeeze.pt")}
     config = ScoringConfig(lpips=["squeeze"], lpips_weights=weights, dists=False)
     assert score_images(truth.images, truth, config)["lpips_squeeze"].value == 0
+
+
+def test_points_are_scored_against_the_object_alone(truth: Truth) -> None:
+    """A line of 101 points over a length of 1: the tolerance is 2 %, two points to each side."""
+    line = torch.stack([torch.linspace(0, 1, 101), torch.zeros(101), torch.zeros(101)], 1)
+    ground = torch.tensor([[0.5, 0.05, 0.0]])
+    known = replace(truth, surface=TrueSurface(line, ground))
+    made = torch.cat([line[:51], ground, torch.tensor([[0.5, -0.05, 0.0], [9.0, 9.0, 9.0]])])
+    scores = {name: score.value for name, score in score_points(made, known).items()}
+    assert scores["accuracy_share"] == pytest.approx(52 / 53)  # the far one is outside the box
+    assert scores["completeness"] == pytest.approx(53 / 101)
+    assert scores["accuracy_distance"] == pytest.approx(0.05 / 53)
+    both = 52 / 53 + 53 / 101
+    assert scores["f_score"] == pytest.approx(2 * 52 / 53 * 53 / 101 / both)
+
+
+@pytest.mark.parametrize(("points", "said"), [(None, "no geometry"), (0, "surface is not known")])
+def test_geometry_that_cannot_be_scored_says_why(
+    truth: Truth, points: int | None, said: str
+) -> None:
+    scores = score_points(None if points is None else torch.zeros(3, 3), truth)
+    assert len(scores) == 4
+    assert all(s.value is None and said in s.reason for s in scores.values())

@@ -14,6 +14,7 @@ from benchmarks.compare import compare
 from benchmarks.results import TIDY, read_results
 from benchmarks.verify import verify
 from extrap_train.errors import InputError
+from extrap_train.jobs.slurm import SubmittedLauncher
 from tests.benchmarks.tables import greys_folder, run_greys, write_own
 
 
@@ -306,3 +307,48 @@ def test_the_readmes_method_runs_as_it_stands(tmp_path: Path) -> None:
     (own / "method" / "average.yaml").write_text(yaml)
     assert run_greys(own, tmp_path / "out", "methods=[average]", quick=True) == 0
     assert read_results(greys_folder(tmp_path / "out")).cells[0]["status"] == "ok"
+
+
+def test_a_cluster_makes_the_same_table(own: Path, finished: Path, tmp_path: Path) -> None:
+    """The code that submits to SLURM, with submitit's own executor for a machine without it."""
+    import submitit
+
+    executor = submitit.LocalExecutor(tmp_path / "submitted")
+    launcher = SubmittedLauncher(executor, tasks=2, poll_seconds=0.05)
+    assert run_greys(own, tmp_path, launcher=launcher) == 0
+    pd.testing.assert_frame_equal(_table(tmp_path), _table(finished))
+    assert _pictures(tmp_path) == _pictures(finished)
+
+
+def test_slurm_takes_the_clusters_options_and_says_where_there_is_none(
+    own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    words = ["run", "greys", "--slurm", "slurm.partition=gpu", "--config-dir", str(own)]
+    assert main([*words, f"output={tmp_path / 'out'}"]) == 1
+    assert "there is no sbatch on this machine" in capsys.readouterr().err
+    assert main([*words, "slurm.partitoin=gpu"]) == 1
+    assert "did you mean slurm.partition" in capsys.readouterr().err
+
+
+def test_geometry_is_scored_kept_and_verified(own: Path, copy: Path) -> None:
+    """Five points in the middle of an apple: none on its surface, and none of it shown."""
+    assert run_greys(own, copy, "methods=[solid,dark]") == 0
+    table = pd.read_csv(copy / "greys" / "greys.csv").set_index(["method", "metric"])["value"]
+    assert (table["solid", "f_score"] == 0).all()
+    assert (table["solid", "accuracy_distance"] > 0.1).all()
+    assert table["dark", "f_score"].isna().all()
+    folder = greys_folder(copy)
+    assert verify(folder) == (4, [])
+    cloud = next(copy.glob("greys/cells/*/points.npy"))
+    cloud.write_bytes(cloud.read_bytes()[:-1] + b"!")
+    with pytest.raises(InputError, match="not what its cell's hash says"):
+        verify(folder)
+
+
+def test_a_quick_table_says_that_it_is_one(own: Path, finished: Path, tmp_path: Path) -> None:
+    run_greys(own, tmp_path, quick=True)
+    title = "Greys (quick: a part of the table)"
+    assert f"<title>{title}" in (tmp_path / "greys" / "index.html").read_text()
+    assert title in (tmp_path / "greys" / "greys.md").read_text()
+    assert "quick" not in (finished / "greys" / "greys.md").read_text()

@@ -1,0 +1,92 @@
+"""The community's split is read as its authors hand it out: folders of a few made-up scenes."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from benchmarks.captures import freeze, open_captures
+from benchmarks.catalogue import Catalogue
+from benchmarks.plan import TableFolder
+from benchmarks.results import read_results
+from benchmarks.runner import RunOptions, run_table
+from extrap_train.config import CapturesConfig, RulesConfig
+from extrap_train.data.images import to_eight_bits
+from extrap_train.errors import InputError
+from extrap_train.geometry.opengl import opengl_from_world_to_cam
+from extrap_train.jobs.local import LocalLauncher
+from tests.benchmarks.analytic import view_at
+
+_SIZE, _COUNT = 24, 8
+_RULES = RulesConfig(image_size=_SIZE, views=[3], draws=["given"], depth="stereo")
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """One scene; its transforms.json lists the frames backwards."""
+    folder = tmp_path / "split" / "34_1479_4753"
+    (folder / "images").mkdir(parents=True)
+    frames = []
+    for index in range(_COUNT):
+        view = view_at(360 * index / _COUNT, _SIZE)
+        image = Image.fromarray(to_eight_bits(view.image.permute(1, 2, 0)))
+        image.save(folder / "images" / f"frame{index:06d}.png")
+        frames.append(
+            {
+                "file_path": f"images/frame{index:06d}.png",
+                "transform_matrix": opengl_from_world_to_cam(view.camera.world_to_cam).tolist(),
+            }
+        )
+    k = view.camera.intrinsics
+    lens = {"fl_x": k[0, 0].item(), "fl_y": k[1, 1].item(), "cx": _SIZE / 2, "cy": _SIZE / 2}
+    content = {**lens, "w": _SIZE, "h": _SIZE, "frames": frames[::-1]}
+    (folder / "transforms.json").write_text(json.dumps(content))
+    split = {"train_ids": [0, 2, 5], "test_ids": [1, 7]}
+    (folder / "train_test_split_3.json").write_text(json.dumps(split))
+    return tmp_path / "split"
+
+
+def _captures(root: Path) -> CapturesConfig:
+    return CapturesConfig(source="reconfusion", root=str(root))
+
+
+def test_ids_count_the_frames_in_name_order(root: Path) -> None:
+    config = _captures(root)
+    (draw,) = freeze(config, _RULES, open_captures(config, [])).draws
+    assert (draw.sequence, draw.n_views, draw.draw) == ("34_1479_4753", 3, "given")
+    assert [Path(name).stem[-1] for name in draw.inputs] == ["0", "2", "5"]
+    assert [Path(name).stem[-1] for name in draw.targets] == ["1", "7"]
+
+
+@pytest.mark.parametrize(
+    "content", ['{"train_ids": [0, 99], "test_ids": [1]}', '{"train_ids": [0]}', "{"]
+)
+def test_a_damaged_split_is_named(root: Path, content: str) -> None:
+    file = root / "34_1479_4753" / "train_test_split_3.json"
+    file.write_text(content)
+    config = _captures(root)
+    with pytest.raises(InputError, match=r"train_test_split_3\.json"):
+        freeze(config, _RULES, open_captures(config, []))
+
+
+def test_a_split_that_is_missing_and_a_wrong_root_are_named(root: Path) -> None:
+    config = _captures(root)
+    with pytest.raises(InputError, match=r"train_test_split_9\.json"):
+        freeze(config, replace(_RULES, views=[9]), open_captures(config, []))
+    with pytest.raises(InputError, match=r"no folder in it has a transforms\.json"):
+        open_captures(_captures(root / "34_1479_4753"), [])
+
+
+def test_the_table_runs_with_published_numbers_beside_it(root: Path, tmp_path: Path) -> None:
+    catalogue = Catalogue.with_own()
+    words = [f"rules.image_size={_SIZE}", "rules.views=[3]", "methods=[nearest,inpainted]"]
+    table = catalogue.table("reconfusion", [f"captures.root={root}", f"output={tmp_path}", *words])
+    assert run_table(table, catalogue, RunOptions(launcher=LocalLauncher(1))) == 0
+    cells = read_results(TableFolder(tmp_path / "reconfusion")).cells
+    assert {cell["status"] for cell in cells} == {"ok"}
+    assert all(cell["metrics"]["psnr"]["value"] > 8 for cell in cells)
+    text = (tmp_path / "reconfusion" / "reconfusion.md").read_text()
+    assert "Reported, not measured here" in text
+    assert "ReconFusion (second-hand)" in text
