@@ -85,8 +85,8 @@ class Co3dFrames(ListOf[Frame]):
             intrinsics=np.stack([camera.intrinsics.numpy() for camera in cameras]),
             image_path=_encoded(annotation.image_path for annotation in annotations),
             mask_path=_encoded(annotation.mask_path for annotation in annotations),
-            depth_path=_encoded(depth and depth.path for depth in depths),
-            depth_mask_path=_encoded(depth and depth.mask_path for depth in depths),
+            depth_path=_encoded(depth.path if depth else None for depth in depths),
+            depth_mask_path=_encoded(depth.mask_path if depth else None for depth in depths),
             depth_scale=np.array([depth.scale if depth else 0.0 for depth in depths]),
         )
 
