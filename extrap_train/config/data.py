@@ -32,7 +32,7 @@ class SyntheticConfig(DataConfig):
     name: str = "synthetic"
     test_sequences: int = 5
     """Sequences 0 … n-1 are for testing, whatever else is asked for."""
-    train_sequences: int = 40
+    train_sequences: int = 100
     """The sequences behind those."""
     frames: int = 24
     """Photographs around each scene."""

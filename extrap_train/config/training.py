@@ -13,7 +13,7 @@ class TrainerConfig:
     """Views a step and device."""
     warmup_steps: int = 100
     """Steps in which the learning rate rises to its full height."""
-    full_rate_steps: int = 3000
+    full_rate_steps: int = 400
     """Steps at the full learning rate; from there it falls as 1/√step (Karras et al. 2024), which,
     unlike a decay towards a last step, leaves a run that can be prolonged.
     """
