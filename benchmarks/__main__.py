@@ -10,7 +10,7 @@ from benchmarks.catalogue import Catalogue
 from extrap_train.config import CATEGORIES
 from extrap_train.errors import InputError
 
-PERF_NAMES = ("align", "depth", "gaussians", "sample", "train", "warp")
+PERF_NAMES = ("align", "depth", "gaussians", "prep", "sample", "train", "warp")
 KINDS = ("methods", "tables", "categories")
 FORMATS = ("csv", "md", "latex", "html")
 
