@@ -21,6 +21,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from extrap_train.data.files import write_whole
+from extrap_train.errors import InputError, did_you_mean
 
 Row = dict[str, str]
 METRIC = "result."
@@ -34,7 +35,13 @@ _SHOWN = ("psnr", "psnr_holes", "ssim", "lpips")
 
 
 class SweepTable(Callback):
-    """Writes a row when a job of a sweep has ended, however it ended."""
+    """Writes a row when a job of a sweep has ended, however it ended.
+
+    `objective` names the metric that a sweeper which looks for the best is told as the job's value.
+    """
+
+    def __init__(self, objective: str | None = None) -> None:
+        self.objective = objective
 
     def on_job_start(self, config: DictConfig, **_: Any) -> None:
         """Hydra's hook."""
@@ -45,7 +52,11 @@ class SweepTable(Callback):
         if config.hydra.mode != RunMode.MULTIRUN:
             return
         seconds = time.perf_counter() - self._started
-        row = row_of(int(config.hydra.job.num), seconds, job_return)
+        number = int(config.hydra.job.num)
+        row = row_of(number, seconds, job_return)
+        if self.objective is not None and job_return.status is JobStatus.COMPLETED:
+            _give_objective(job_return, row, self.objective)
+            row |= {"status": _status(job_return), _LAST: _reason(job_return)}
         folder = Path(config.hydra.sweep.dir)
         rows = add_row(folder / "sweep.csv", row)
         draw(rows, folder / "sweep.png")
@@ -58,19 +69,43 @@ def row_of(number: int, seconds: float, job: JobReturn) -> Row:
 
     The metrics are those of `summary.json` in the folder that the task returned.
     """
-    # Asked for in public, the value of a job that failed is raised and printed.
-    value, failed = job._return_value, job.status is not JobStatus.COMPLETED
+    value = job._return_value
     overrides = dict(word.lstrip("+~").partition("=")[::2] for word in job.overrides or ())
     metrics = metrics_at(value) if isinstance(value, Path) else {}
-    reason = f"{type(value).__name__}: {' '.join(str(value).split())}" if failed else ""
     return {
         "job": str(number),
-        "status": "failed" if failed else "ok",
+        "status": _status(job),
         "seconds": f"{seconds:.1f}",
         **overrides,
         **{METRIC + name: repr(number) for name, number in metrics.items()},
-        _LAST: reason,
+        _LAST: _reason(job),
     }
+
+
+def _status(job: JobReturn) -> str:
+    return "ok" if job.status is JobStatus.COMPLETED else "failed"
+
+
+def _reason(job: JobReturn) -> str:
+    # Asked for in public, the value of a job that failed is raised and printed.
+    error = job._return_value
+    if job.status is JobStatus.COMPLETED:
+        return ""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+
+def _give_objective(job: JobReturn, row: Row, objective: str) -> None:
+    """The metric in place of the folder; a job that lacks it has failed."""
+    found = row.get(METRIC + objective)
+    if found is not None:
+        job.return_value = float(found)
+        return
+    known = [name.removeprefix(METRIC) for name in row if name.startswith(METRIC)]
+    job.status = JobStatus.FAILED
+    job.return_value = InputError(
+        f"hydra.callbacks.sweep_table.objective={objective}: the job has no such metric; "
+        f"{did_you_mean(objective, known)}"
+    )
 
 
 def metrics_at(folder: Path) -> dict[str, float]:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+import yaml
 
 from extrap_train.__main__ import main
 from extrap_train.config import TrainConfig
@@ -23,7 +24,7 @@ def _trained(tmp_path: Path) -> Fake:
         if config.category.name == "cup":
             raise InputError("no training pairs for cup: loosen prep")
         folder = tmp_path / f"{config.category.name}-{config.trainer.steps}"
-        folder.mkdir()
+        folder.mkdir(exist_ok=True)  # a sampler may ask twice
         psnr = 20.0 + config.trainer.steps
         scores = {"model": {"psnr": psnr, "lpips": None}, "nearest": {"psnr": 15.0}}
         summary = {"validation": scores, "seconds": {"train": 3.0}, "provenance": {"seed": 0}}
@@ -100,3 +101,27 @@ def test_a_single_run_has_no_table(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     monkeypatch.setattr(sys, "argv", ["extrap_train", "category=apple"])
     main()
     assert not list(tmp_path.rglob("sweep.csv"))
+
+
+def test_a_sweeper_is_told_the_objective(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    words = ["category=apple", "trainer.steps=int(interval(1, 9))", "hydra/sweeper=optuna"]
+    search = ["hydra.sweeper.n_trials=3", "hydra.sweeper.direction=maximize"]
+    search += ["hydra.sweeper.sampler.seed=1", "model.weight_decay=0.01"]
+    objective = "hydra.callbacks.sweep_table.objective=validation.model.psnr"
+    task = _trained(tmp_path)
+    assert _sweep(monkeypatch, task, tmp_path / "sweep", *words, *search, objective) is None
+    table = pd.read_csv(tmp_path / "sweep" / "sweep.csv")
+    assert len(table) == 3
+    best = yaml.safe_load((tmp_path / "sweep" / "optimization_results.yaml").read_text())
+    assert best["best_value"] == table["result.validation.model.psnr"].max()
+    assert best["best_params"]["trainer.steps"] == best["best_value"] - 20
+
+
+def test_an_objective_that_is_not_measured_is_named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    objective = "hydra.callbacks.sweep_table.objective=validation.model.psrn"
+    said = _sweep(monkeypatch, _trained(tmp_path), tmp_path, "category=apple", objective)
+    assert said is not None
+    assert "no such metric; did you mean validation.model.psnr" in said
+    assert pd.read_csv(tmp_path / "sweep.csv")["status"][0] == "failed"
