@@ -49,12 +49,10 @@ def _problems(results: Results, cell: dict[str, Any]) -> Iterator[str]:
     if scene.data_hash != cell["hashes"]["data"]:
         yield f"{scene.folder} holds other data than the cell was made from"
         return
-    files = (
-        read_cell_files(results.folder.cells / cell["key"], cell, kind)
-        for kind in ("images", "points")
-    )
+    folder = results.folder.cells / cell["key"]
+    pictures, points = (read_cell_files(folder, cell, kind) for kind in ("images", "points"))
     scoring = ScoringConfig(**results.plan["table"]["scoring"])
-    again = score_cell(*files, scene.truth(), scoring)
+    again = score_cell(pictures, points, scene.truth(), scoring)
     for name, stated in scores_of(cell).items():
         found = again.get(name, Score(None, "the metric is not known any more"))
         if not _same(stated.value, found.value):
