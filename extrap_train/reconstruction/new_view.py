@@ -83,7 +83,8 @@ def propose(
     prior = prior_of(known, picture.camera, indices)
     measured, edges = _measured(known, picture, indices, source)
     agreement = _agreement(picture, prior, measured, known.tolerance)
-    depth, confidence = _fused(prior, measured, known.tolerance, options.repair)
+    kept = _contradicted(known, picture.camera, prior, measured) if options.repair else None
+    depth, confidence = _fused(prior, measured, known.tolerance, kept)
     unbacked = (depth > 0) & ~prior.mask
     if options.reject and agreement < options.least_agreement:
         depth, confidence = (torch.where(unbacked, 0, x) for x in (depth, confidence))
@@ -165,23 +166,38 @@ def _differ(one: Float[Tensor, "h w"], other: Float[Tensor, "h w"]) -> Float[Ten
     return torch.where(nearer > 0, farther / nearer.clamp(min=1e-30) - 1, torch.inf)
 
 
+def _contradicted(
+    known: GlobalMap, camera: Camera, prior: Prior, measured: _Measured
+) -> Bool[Tensor, "h w"]:
+    """Where the map knows better: it has a surface in front of the measured one, or has looked
+    through the measured one. In front of what it shows, a new surface contradicts nothing.
+    """
+    surer = prior.confidence >= measured.confidence
+    looked_through = _seen_through(known, measured.depth, measured.confidence, camera)
+    return surer & ((measured.depth > prior.depth) | looked_through)
+
+
 def _fused(
-    prior: Prior, measured: _Measured, tolerance: float, repair: bool
+    prior: Prior,
+    measured: _Measured,
+    tolerance: float,
+    contradicted: Bool[Tensor, "h w"] | None,
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
     """One depth from the map's and the measured one, and its confidence; 0 where neither is.
 
-    Where both agree, their weighted mean; where they do not, the surer one, and without `repair`
-    what was measured.
+    Where both agree, their weighted mean; where they do not, the map's where it contradicts what
+    was measured.
     """
     same = measured.reliable & prior.mask & (_differ(prior.depth, measured.depth) <= tolerance)
     total = (prior.confidence + measured.confidence).clamp(min=1e-6)
     mean = (prior.confidence * prior.depth + measured.confidence * measured.depth) / total
-    surer = prior.confidence >= measured.confidence
-    from_map = prior.mask & (~measured.reliable | (surer if repair else surer & False))
-    contradicted = measured.reliable & prior.mask & ~same
+    from_map = prior.mask & ~measured.reliable
+    if contradicted is not None:
+        from_map |= prior.mask & contradicted
+    differ = measured.reliable & prior.mask & ~same
     depth = torch.where(from_map, prior.depth, torch.where(measured.reliable, measured.depth, 0))
     confidence = torch.where(from_map, prior.confidence, measured.confidence)
-    confidence = torch.where(contradicted, CONTRADICTED * confidence, confidence)
+    confidence = torch.where(differ, CONTRADICTED * confidence, confidence)
     depth = torch.where(same, mean, depth)
     confidence = torch.where(same, torch.maximum(prior.confidence, measured.confidence), confidence)
     return depth, torch.where(depth > 0, confidence, 0)
