@@ -135,4 +135,4 @@ def test_handling_keeps_spoiled_views_out(spoil: Spoil, stubborn: bool) -> None:
             f"{spoil.__name__}, {'every' if stubborn else 'first'} attempt, {name}: accuracy "
             f"{scores['accuracy']:.3f}, completeness {scores['completeness']:.3f}"
         )
-    assert accuracy["everything on"] >= accuracy["everything off"]
+    assert accuracy["everything on"] >= accuracy["everything off"] + 0.1
