@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 from torch.nn import functional
 
@@ -56,17 +56,17 @@ def _points_of(known: GlobalMap, index: int, votes: bool, subdivide: int) -> Poi
     normals, on_surface = normals_from_depth(view.depth, view.camera)
     points = unproject_to_world(view.depth, view.camera)
     confidence = view.confidence
-    kept = view.fresh & on_surface  # a few surfaces have no normal
+    sound = on_surface  # a few surfaces have no normal
     if votes:
         confidence, share = _voted(known, index, points.flatten(0, 1))
-        confidence, share = confidence.view_as(kept), share.view_as(kept)
-        kept &= share >= 0.5
+        confidence, share = confidence.view_as(sound), share.view_as(sound)
+        sound = sound & (share >= 0.5)
         confidence = confidence * share
     rotation = view.camera.cam_to_world[:3, :3]
     values = torch.cat(
         [points, view.view.image.permute(1, 2, 0), normals @ rotation.mT, confidence[..., None]], -1
     )
-    rows = _subdivided(values, kept, view, subdivide)
+    rows = _subdivided(values, view.fresh & sound, sound, view, subdivide)
     return PointCloud(
         points=rows[:, :3],
         colors=rows[:, 3:6].clamp(0, 1),
@@ -95,19 +95,21 @@ def _voted(
 
 
 def _subdivided(
-    values: Float[Tensor, "h w c"], kept: Tensor, view: MapView, parts: int
+    values: Float[Tensor, "h w c"],
+    kept: Bool[Tensor, "h w"],
+    sound: Bool[Tensor, "h w"],
+    view: MapView,
+    parts: int,
 ) -> Float[Tensor, "m c"]:
-    """The kept pixels' rows, and between four neighbours of one surface further ones.
+    """The kept pixels' rows, and further ones between four sound neighbours of one surface of which
+    at least one is kept: so no seam stays open where one view's points end and another's begin.
 
     Points between are interpolated in the plane of the picture, which on a surface that is nearly
     flat within a pixel is the surface.
     """
     rows = [values[kept]]
-    corners = [values[:-1, :-1], values[:-1, 1:], values[1:, :-1], values[1:, 1:]]
-    depths = torch.stack(
-        [view.depth[:-1, :-1], view.depth[:-1, 1:], view.depth[1:, :-1], view.depth[1:, 1:]]
-    )
-    whole = kept[:-1, :-1] & kept[:-1, 1:] & kept[1:, :-1] & kept[1:, 1:]
+    corners, depths = _of_four(values), _of_four(view.depth)
+    whole = _of_four(sound).all(0) & _of_four(kept).any(0)
     whole &= depths.amax(0) < depths.amin(0).clamp(min=1e-30) * (1 + LARGEST_STEP)
     for down in range(parts):
         for right in range(parts):
@@ -118,3 +120,8 @@ def _subdivided(
             weighted = [s * c[whole] for s, c in zip(shares, corners, strict=True)]
             rows.append(torch.stack(weighted).sum(0))
     return torch.cat(rows)
+
+
+def _of_four(image: Shaped[Tensor, "h w *c"]) -> Shaped[Tensor, "4 h2 w2 *c"]:
+    """What stands at the four corners of every square of neighbouring pixels."""
+    return torch.stack([image[:-1, :-1], image[:-1, 1:], image[1:, :-1], image[1:, 1:]])
