@@ -113,7 +113,7 @@ def _similarities(pairs: _Pairs) -> tuple[Float[Tensor, "e 4 4"], Float[Tensor, 
     Fitted from the world to the edge and inverted: noise is in the edge's points alone, and as
     regressors they would shrink the scale.
     """
-    robust = torch.ones_like(pairs.weight)
+    robust, extent = torch.ones_like(pairs.weight), _extent(pairs)[:, None]
     for step in range(SIMILARITY_ROUNDS):
         weight = (pairs.weight * robust).clamp(min=1e-12)
         rotation, shift, scale = roma.rigid_points_registration(
@@ -121,7 +121,7 @@ def _similarities(pairs: _Pairs) -> tuple[Float[Tensor, "e 4 4"], Float[Tensor, 
         )
         fitted = scale[:, None, None] * (pairs.world @ rotation.mT) + shift[:, None]
         residual = (fitted - pairs.edge).norm(dim=-1)
-        relative = residual / _extent(pairs)[:, None]
+        relative = residual / extent
         median = _masked_median(relative, pairs.weight > 0)
         sigma = (median / _CHI3_MEDIAN).clamp(min=_LEAST_SPREAD)
         ratio = relative / sigma[:, None]
