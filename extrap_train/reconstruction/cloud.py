@@ -102,14 +102,15 @@ def _subdivided(
     parts: int,
 ) -> Float[Tensor, "m c"]:
     """The kept pixels' rows, and further ones between four sound neighbours of one surface of which
-    at least one is kept: so no seam stays open where one view's points end and another's begin.
+    at least two are kept: so no seam stays open where one view's points end and another's begin,
+    and a lone pixel, often noise, gains no weight.
 
     Points between are interpolated in the plane of the picture, which on a surface that is nearly
     flat within a pixel is the surface.
     """
     rows = [values[kept]]
     corners, depths = _of_four(values), _of_four(view.depth)
-    whole = _of_four(sound).all(0) & _of_four(kept).any(0)
+    whole = _of_four(sound).all(0) & (_of_four(kept).sum(0) >= 2)
     whole &= depths.amax(0) < depths.amin(0).clamp(min=1e-30) * (1 + LARGEST_STEP)
     for down in range(parts):
         for right in range(parts):
