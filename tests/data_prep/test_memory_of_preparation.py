@@ -1,6 +1,7 @@
 """Memory hardly grows with the number of sequences: of reading, of a job, of a whole run.
 
-`python -m pytest -s -m slow tests/data_prep/test_memory_of_preparation.py` prepares ten thousand sequences.
+`python -m pytest -s -m slow tests/data_prep/test_memory_of_preparation.py` prepares ten thousand
+sequences.
 """
 
 import gzip
