@@ -16,7 +16,13 @@ from filelock import FileLock, Timeout
 from rich.console import Console
 from tqdm import tqdm
 
-from extrap_train.config import DatasetDepthConfig, StereoConfig, SyntheticConfig, TrainConfig
+from extrap_train.config import (
+    DatasetDepthConfig,
+    StereoConfig,
+    SyntheticConfig,
+    TrainConfig,
+    dotted,
+)
 from extrap_train.data.files import write_whole
 from extrap_train.data.scene import SYNTHETIC_SCHEME, open_scene
 from extrap_train.data.sequences import Sequence
@@ -40,10 +46,19 @@ from extrap_train.reconstruction.planner import Query, expected_order, orbit_que
 from extrap_train.reconstruction.pose_check import check_poses
 from extrap_train.reconstruction.viewer import CloudViewer
 from extrap_train.tasks.completed import Completed, write_completed
-from extrap_train.tasks.scene_inputs import required_scene, trained_model
+from extrap_train.tasks.scene_inputs import newest_model, required_scene, trained_model
 from extrap_train.views import stack_cameras, stack_poses
 
-_NOT_PART_OF_THE_MAP = ("dry_run", "viewer", "port", "held_out", "splats")
+_NOT_PART_OF_THE_MAP = (
+    "dry_run",
+    "viewer",
+    "port",
+    "held_out",
+    "splats",
+    "confidence.votes",
+    "confidence.least_confidence",
+)
+"""May differ on resume: what is made of the map once it is whole."""
 
 
 @dataclass(frozen=True)
@@ -161,17 +176,19 @@ def _identity(job: _Job) -> dict[str, Any]:
     """The options that a map depends on."""
     config = job.config
     complete_options = {
-        key: value
-        for key, value in asdict(config.complete).items()
-        if key not in _NOT_PART_OF_THE_MAP
+        f"complete.{key}": value
+        for key, value in dotted(asdict(config.complete)).items()
+        if not f"{key}.".startswith(tuple(f"{name}." for name in _NOT_PART_OF_THE_MAP))
     }
+    exact = config.complete.generator == "exact"
     return {
         "scene": config.scene,
+        "data.seed": getattr(config.data, "seed", None),
         "inputs": [job.sequence.frames[i].name for i in job.inputs],
         "depth": asdict(config.depth),
-        "complete": complete_options,
+        **complete_options,
         "sampler": asdict(config.sampler),
-        "weights": config.weights,
+        "weights": None if exact else config.weights or str(newest_model(config).resolve()),
         "adapter": config.adapter,
         "seed": config.seed,
     }

@@ -62,14 +62,20 @@ def trained_model(config: TrainConfig) -> ExtrapolationModel:
     """The model that `weights` names, by default the category's newest, with its adapter if any."""
     if config.weights is not None:
         return open_model(config.weights, config.adapter)
-    category, name = config.category.name, config.model.name
-    newest = Path(config.output) / "train" / category / name / "latest" / "model"
+    newest = newest_model(config)
     if not newest.is_dir():
         raise InputError(
-            f"{newest}: there is no trained model of {category}; train one (task=category), or "
+            f"{newest}: there is no trained model of {config.category.name}; train one "
+            "(task=category), or "
             "give weights=FOLDER, or weights=base for the packaged model"
         )
     return open_model(str(newest), config.adapter)
+
+
+def newest_model(config: TrainConfig) -> Path:
+    """Where the category's newest run leaves its model."""
+    runs = Path(config.output) / "train" / config.category.name / config.model.name
+    return runs / "latest" / "model"
 
 
 def open_model(weights: str, adapter: str | None = None) -> ExtrapolationModel:
