@@ -40,8 +40,8 @@ def test_the_walk_closes_the_circle_and_keeps_the_object_in_frame(category):
         gaps = np.diff(azimuths, append=azimuths[0] + 2 * np.pi)
         assert np.rad2deg(gaps.max()) < 30
         elevations = np.rad2deg(np.arcsin(offsets[:, 2] / np.linalg.norm(offsets, axis=1)))
-        assert elevations.min() > 9
-        assert elevations.max() < 41
+        assert elevations.min() > 21
+        assert elevations.max() < 51
         points = torch.from_numpy(object_vertices(scene)).float().expand(24, -1, -1)
         pixels, depth = project(points, cameras)
         assert (depth > 0).all()
