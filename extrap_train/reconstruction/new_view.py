@@ -49,7 +49,9 @@ class Proposal:
     view: View
     confidence: Float[Tensor, "h w"]
     agreement: float
-    """Share of the testable pixels whose picture and depth agree with the map: the lesser one."""
+    """Share of the testable pixels whose picture and depth agree with the map: the lesser one; 0
+    where nothing can be tested, for what nobody confirms may be anything.
+    """
     edges: int
     """Known views that it could be aligned to."""
 
@@ -150,14 +152,16 @@ def _reliable(confidence: Tensor) -> Tensor:
 
 
 def _agreement(picture: View, prior: Prior, measured: _Measured, tolerance: float) -> float:
-    """Share of testable pixels that agree, by picture and by depth: the lesser one."""
+    """Share of testable pixels that agree, by picture and by depth: the lesser one; 0 without any
+    testable pixel.
+    """
     same, comparable = alike(picture.image, prior.image, prior.mask)
     shares = [float(same.sum() / comparable.sum().clamp(min=1))] if comparable.any() else []
     tested = measured.reliable & (prior.confidence >= RELIABLE_CONFIDENCE)
     if tested.any():
         agrees = _differ(prior.depth, measured.depth) <= 2 * tolerance
         shares.append(float((agrees & tested).sum() / tested.sum()))
-    return min(shares, default=1.0)
+    return min(shares, default=0.0)
 
 
 def _differ(one: Float[Tensor, "h w"], other: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:

@@ -17,6 +17,7 @@ from extrap_train.reconstruction.cloud import cloud_of
 from extrap_train.reconstruction.completion import Workshop, complete, map_of_inputs
 from extrap_train.reconstruction.global_map import GENERATED, GlobalMap
 from extrap_train.reconstruction.map_files import load_map, save_view
+from extrap_train.reconstruction.new_view import prior_of, propose
 from extrap_train.reconstruction.planner import orbit_queries
 from extrap_train.views import Camera, View
 
@@ -73,6 +74,17 @@ class TracedDepth:
     def point_maps(self, first, second) -> PointMaps:
         one, two = self.depth_map(first, ()), self.depth_map(second, ())
         return point_maps_of(first, one, replace(second, depth=two.depth), two)
+
+
+@dataclass(frozen=True)
+class Wall(TracedDepth):
+    """A picture without depth shows a wall before its camera."""
+
+    depth: float
+
+    def depth_map(self, view, neighbours):
+        depth = torch.full((SIZE, SIZE), self.depth) if view.depth is None else view.depth
+        return DepthMap(depth, (depth > 0).float())
 
 
 def inputs(*azimuths_deg: float) -> GlobalMap:
@@ -173,6 +185,23 @@ def test_a_wrong_picture_is_noticed_and_made_again(whole):
     tried = {step.name: step.attempts for step in steps}
     assert tried.pop("orbit090") == 2
     assert set(tried.values()) == {1}
+
+
+def test_a_view_of_which_nothing_can_be_tested_shows_nothing_new():
+    """It looks away from all that the map shows: no pixel confirms where it stands."""
+    known = inputs(-30.0, 0.0, 30.0)
+    away = scenes.orbit_camera(0.0, size=SIZE)
+    turn = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
+    camera = replace(away, world_to_cam=turn @ away.world_to_cam)
+    picture = View(torch.rand(3, SIZE, SIZE), camera, name="away")
+    wall = Wall(2.0)
+    assert not prior_of(known, camera, [0, 1, 2]).mask.any()
+    proposal = propose(known, picture, [0, 1, 2], wall, ConfidenceConfig())
+    assert proposal.edges == 3
+    assert proposal.agreement == 0
+    assert not proposal.confidence.any()
+    trusting = propose(known, picture, [0, 1, 2], wall, ConfidenceConfig(reject=False))
+    assert trusting.confidence.any()
 
 
 def test_confidence_handling_keeps_a_stubbornly_wrong_view_out_of_the_cloud():
