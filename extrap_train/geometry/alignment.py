@@ -85,21 +85,24 @@ def align_view(camera: Camera, edges: Edges) -> Alignment:
 
 @dataclass(frozen=True)
 class _Pairs:
-    edge: Float[Tensor, "e m 3"]
-    world: Float[Tensor, "e m 3"]
+    """Coordinate by coordinate, as sums over points are fastest."""
+
+    edge: Float[Tensor, "e 3 m"]
+    world: Float[Tensor, "e 3 m"]
     weight: Float[Tensor, "e m"]
 
 
 def _pairs(edges: Edges) -> _Pairs:
     """An even choice of the known views' points, weighted by what their confidence ranks."""
     stride = max(1, math.ceil(edges.known_points.shape[1] / MOST_PAIRS))
-    edge, world = edges.known_points[:, ::stride], edges.world_points[:, ::stride]
-    finite = torch.isfinite(edge).all(-1) & torch.isfinite(world).all(-1)
+    edge, world = (
+        points[:, ::stride].mT.contiguous() for points in (edges.known_points, edges.world_points)
+    )
+    finite = torch.isfinite(edge).all(1) & torch.isfinite(world).all(1)
     used = finite & edges.world_known[:, ::stride]
     weight = torch.where(used, _weight(edges.known_confidence[:, ::stride]), 0)
-    return _Pairs(
-        torch.where(used[..., None], edge, 0), torch.where(used[..., None], world, 0), weight
-    )
+    edge, world = (torch.where(used[:, None], points, 0) for points in (edge, world))
+    return _Pairs(edge, world, weight)
 
 
 def _weight(confidence: Tensor) -> Tensor:
@@ -116,11 +119,9 @@ def _similarities(pairs: _Pairs) -> tuple[Float[Tensor, "e 4 4"], Float[Tensor, 
     robust, extent = torch.ones_like(pairs.weight), _extent(pairs)[:, None]
     for step in range(SIMILARITY_ROUNDS):
         weight = (pairs.weight * robust).clamp(min=1e-12)
-        rotation, shift, scale = roma.rigid_points_registration(
-            pairs.world, pairs.edge, weights=weight, compute_scaling=True
-        )
-        fitted = scale[:, None, None] * (pairs.world @ rotation.mT) + shift[:, None]
-        residual = (fitted - pairs.edge).norm(dim=-1)
+        rotation, shift, scale = _procrustes(pairs.world, pairs.edge, weight)
+        fitted = (scale[:, None, None] * rotation) @ pairs.world + shift[..., None]
+        residual = _length(fitted - pairs.edge)
         relative = residual / extent
         median = _masked_median(relative, pairs.weight > 0)
         sigma = (median / _CHI3_MEDIAN).clamp(min=_LEAST_SPREAD)
@@ -136,6 +137,23 @@ def _similarities(pairs: _Pairs) -> tuple[Float[Tensor, "e 4 4"], Float[Tensor, 
     return matrix, sigma
 
 
+def _procrustes(
+    source: Float[Tensor, "e 3 m"], target: Float[Tensor, "e 3 m"], weight: Float[Tensor, "e m"]
+) -> tuple[Float[Tensor, "e 3 3"], Float[Tensor, "e 3"], Float[Tensor, " e"]]:
+    """The rotation, shift and scale of the weighted least squares (Umeyama 1991).
+
+    roma's own registration is made for many small problems; of a few large ones it takes thrice
+    the time.
+    """
+    share = (weight / weight.sum(-1, keepdim=True))[:, None]
+    source_middle, target_middle = source @ share.mT, target @ share.mT
+    source, target = source - source_middle, (target - target_middle) * share
+    rotation, singular = roma.special_procrustes(target @ source.mT, return_singular_values=True)
+    scale = singular.sum(-1) / (source.square() @ share.mT).sum((-1, -2)).clamp(min=1e-30)
+    shift = target_middle - scale[:, None, None] * (rotation @ source_middle)
+    return rotation, shift[..., 0], scale
+
+
 def _trust(spread: Float[Tensor, " e"], usable: Bool[Tensor, " e"]) -> Float[Tensor, " e"]:
     """Less for an edge that fits far worse than most do; no more for one that fits better.
 
@@ -147,11 +165,15 @@ def _trust(spread: Float[Tensor, " e"], usable: Bool[Tensor, " e"]) -> Float[Ten
 
 def _extent(pairs: _Pairs) -> Float[Tensor, " e"]:
     """Mean distance of each edge's points from their middle, in the edge's unit."""
-    used = (pairs.weight > 0).to(pairs.edge.dtype)[..., None]
-    count = used.sum(1).clamp(min=1)
-    middle = (pairs.edge * used).sum(1) / count
-    away = ((pairs.edge - middle[:, None]) * used).norm(dim=-1).sum(1) / count[:, 0]
-    return away.clamp(min=1e-30)
+    used = (pairs.weight > 0).to(pairs.edge)[..., None]
+    share = used / used.sum(1, keepdim=True).clamp(min=1)
+    away = _length(pairs.edge - pairs.edge @ share)
+    return (away[:, None] @ share)[:, 0, 0].clamp(min=1e-30)
+
+
+def _length(vectors: Float[Tensor, "e 3 m"]) -> Float[Tensor, "e m"]:
+    """Fifty times faster than a norm along any but the last dimension, on the CPU."""
+    return vectors.square().sum(1).sqrt()
 
 
 def _depths_along_rays(
@@ -210,8 +232,5 @@ def _weighted_median(values: Float[Tensor, "e h w"], weight: Float[Tensor, "e h 
 def _masked_median(values: Float[Tensor, "e n"], mask: Bool[Tensor, "e n"]) -> Float[Tensor, " e"]:
     """The lower median of each row's masked entries, of an even choice of them; 0 without any."""
     stride = max(1, values.shape[1] // MOST_RANKED)
-    chosen = mask[:, ::stride]
-    ordered = torch.where(chosen, values[:, ::stride], torch.inf).sort(-1).values
-    index = ((chosen.sum(-1) - 1) // 2).clamp(min=0)
-    found = ordered.gather(-1, index[:, None])[:, 0]
-    return torch.where(chosen.any(-1), found, 0)
+    chosen = torch.where(mask[:, ::stride], values[:, ::stride], torch.nan)
+    return chosen.nanmedian(-1).values.nan_to_num()
