@@ -11,6 +11,9 @@ class ConfidenceConfig:
     """Where a new depth contradicts a surer one in the map, the map's is taken."""
     free_space: bool = True
     """Pixels in front of what a surer view has seen are left out."""
+    support: bool = True
+    """A view's confidence is scaled by the share of it that the map confirms, and is less where few
+    of its edges measure a pixel."""
     votes: bool = True
     """Points that more views contradict than confirm are left out of the cloud."""
     regenerate: bool = True

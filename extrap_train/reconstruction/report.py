@@ -20,7 +20,8 @@ from extrap_train.reconstruction.cloud_metrics import (
 from extrap_train.reconstruction.completion import Step
 from extrap_train.reconstruction.global_map import GENERATED, GlobalMap
 from extrap_train.reconstruction.inputs import WorldUnit
-from extrap_train.reconstruction.new_view import prior_of, scene_size
+from extrap_train.reconstruction.new_view import scene_size
+from extrap_train.reconstruction.prior import prior_of
 
 TRUTH_POINTS = 60_000
 SEEN_WITHIN_RAD = np.radians(20)

@@ -25,7 +25,7 @@ from extrap_train.reconstruction.export import write_cloud, write_colmap, write_
 from extrap_train.reconstruction.global_map import GENERATED, GIVEN, GlobalMap
 from extrap_train.reconstruction.growth import draw_growth, draw_turntable
 from extrap_train.reconstruction.inputs import WorldUnit
-from extrap_train.reconstruction.new_view import prior_of
+from extrap_train.reconstruction.prior import prior_of
 from extrap_train.reconstruction.report import (
     cloud_scores,
     coverage_of,

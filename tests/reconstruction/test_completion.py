@@ -13,13 +13,17 @@ from extrap_train.data.queries import query_batch
 from extrap_train.depth import RELIABLE_CONFIDENCE, DepthMap, PointMaps, point_maps_of
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.diffusion.generator import GeneratedViews
+from extrap_train.errors import InputError
+from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
 from extrap_train.reconstruction.cloud import cloud_of
 from extrap_train.reconstruction.completion import Workshop, complete, map_of_inputs
 from extrap_train.reconstruction.global_map import GENERATED, GlobalMap
 from extrap_train.reconstruction.map_files import load_map, save_view
-from extrap_train.reconstruction.new_view import prior_of, propose
+from extrap_train.reconstruction.measurement import Measured, supported
+from extrap_train.reconstruction.new_view import propose
 from extrap_train.reconstruction.planner import orbit_queries
-from extrap_train.views import Camera, View
+from extrap_train.reconstruction.prior import Prior, prior_of
+from extrap_train.views import Camera, View, stack_cameras
 
 SIZE = 64
 MOVED = 12
@@ -74,6 +78,17 @@ class TracedDepth:
     def point_maps(self, first, second) -> PointMaps:
         one, two = self.depth_map(first, ()), self.depth_map(second, ())
         return point_maps_of(first, one, replace(second, depth=two.depth), two)
+
+
+@dataclass(frozen=True)
+class OneEdge(TracedDepth):
+    """Pairs no views that stand more than 40° apart."""
+
+    def point_maps(self, first, second) -> PointMaps:
+        cameras = stack_cameras([first.camera, second.camera])
+        if pairwise_angles(cameras, scene_center(cameras))[0, 1] > np.radians(40):
+            raise InputError("too far apart")
+        return super().point_maps(first, second)
 
 
 @dataclass(frozen=True)
@@ -200,15 +215,48 @@ def test_a_view_of_which_nothing_can_be_tested_shows_nothing_new():
     assert proposal.edges == 3
     assert proposal.agreement == 0
     assert not proposal.confidence.any()
-    trusting = propose(known, picture, [0, 1, 2], wall, ConfidenceConfig(reject=False))
-    assert trusting.confidence.any()
+    off = ConfidenceConfig(reject=False, support=False)
+    assert propose(known, picture, [0, 1, 2], wall, off).confidence.any()
+
+
+def test_a_view_is_as_sure_as_what_bears_it_out():
+    """In what it measures beyond the map: less with one edge than with three, and less still if it
+    is wrong where the map can tell.
+    """
+    known = inputs(-30.0, 0.0, 30.0)
+    sound = replace(photograph(scenes.orbit_camera(60.0, size=SIZE)), depth=None)
+    wrong = replace(sound, image=sound.image.roll(MOVED, -1))
+    beyond = ~prior_of(known, sound.camera, [2, 1, 0]).mask
+
+    def surest(picture, source):
+        options = ConfidenceConfig(reject=False)
+        return float(propose(known, picture, [2, 1, 0], source, options).confidence[beyond].max())
+
+    with_three, with_one = surest(sound, TracedDepth()), surest(sound, OneEdge())
+    assert with_three > 0.6
+    assert with_one == pytest.approx(with_three * (1 / 2) / (3 / 4), rel=0.05)
+    assert surest(wrong, OneEdge()) < 0.7 * with_one
+
+
+def test_support_is_the_share_confirmed_and_the_share_of_edges():
+    depth, sure = torch.full((4, 4), 2.0), torch.full((4, 4), 0.8)
+    edges = torch.tensor([1, 2, 3, 3]).expand(4, 4).int()
+    measured = Measured(depth, sure, torch.ones(4, 4, dtype=torch.bool), edges, usable_edges=3)
+    shown = depth.clone()
+    shown[0], shown[1:3] = 0, 2.01  # nothing there, the same surface; then another one
+    shown[3] = 2.5
+    prior = Prior(torch.zeros(3, 4, 4), shown, (shown > 0).float())
+    found = supported(measured, prior, possible_edges=3, tolerance=0.01)
+    by_edges = torch.tensor([1 / 2, 2 / 3, 3 / 4, 3 / 4]) / (3 / 4)
+    assert torch.allclose(found.confidence, (0.8 * 0.5 * by_edges).expand(4, 4))
+    assert found.reliable.all()
 
 
 def test_confidence_handling_keeps_a_stubbornly_wrong_view_out_of_the_cloud():
     wrong = TracedGenerator(("orbit090", "orbit270"), stubborn=True)
     known = inputs(-30.0, 0.0, 30.0)
     handled, _ = completed(known, wrong)
-    off = dict.fromkeys(("repair", "free_space", "votes", "regenerate", "reject"), False)
+    off = dict.fromkeys(("repair", "free_space", "support", "votes", "regenerate", "reject"), False)
     trusting, _ = completed(known, wrong, **off)
     assert off_surface(handled) < off_surface(trusting, votes=False) / 2
 

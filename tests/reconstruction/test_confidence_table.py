@@ -26,7 +26,7 @@ from extrap_train.reconstruction.report import cloud_scores
 from extrap_train.views import Camera, View, stack_poses
 
 _SIZE = 128
-_PARTS = ("repair", "free_space", "votes", "regenerate", "reject")
+_PARTS = ("repair", "free_space", "support", "votes", "regenerate", "reject")
 
 Spoil = Callable[[Float[Tensor, "c h w"]], Float[Tensor, "c h w"]]
 
