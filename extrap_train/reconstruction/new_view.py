@@ -31,6 +31,8 @@ CONTINUED_CONFIDENCE = 0.15
 """Of depth that nothing measures."""
 CONTRADICTED = 0.9
 """Factor on the confidence of a pixel whose two depths differ."""
+AS_SURE = 1e-3
+"""Confidences that differ by less are equal: warping one rounds it."""
 
 
 @dataclass(frozen=True)
@@ -107,9 +109,9 @@ def _contradicted(
     """Where the map knows better: it has a surface in front of the measured one, or has looked
     through the measured one. In front of what it shows, a new surface contradicts nothing.
     """
-    surer = prior.confidence >= measured.confidence
+    no_less_sure = prior.confidence > measured.confidence - AS_SURE
     looked_through = _seen_through(known, measured.depth, measured.confidence, camera)
-    return surer & ((measured.depth > prior.depth) | looked_through)
+    return no_less_sure & ((measured.depth > prior.depth) | looked_through)
 
 
 def _fused(
@@ -155,7 +157,7 @@ def _seen_through(
     for index in known.nearest(camera, MOST_COMPARED):
         other = known.views[index]
         said = look_up(points, other.depth, other.camera, 2 * known.tolerance)
-        surer = other.confidence.flatten()[said.pixel] > confidence.flatten()
+        surer = other.confidence.flatten()[said.pixel] > confidence.flatten() + AS_SURE
         found |= (said.sight == Sight.IN_FRONT) & surer
     return found.view_as(depth) & (depth > 0)
 

@@ -238,6 +238,18 @@ def test_a_view_is_as_sure_as_what_bears_it_out():
     assert surest(wrong, OneEdge()) < 0.7 * with_one
 
 
+def test_behind_a_surface_that_the_map_shows_as_surely_nothing_enters():
+    """Both are sure to 1, but warping has rounded some of the map's confidences below it."""
+    known = inputs(-30.0, 0.0, 30.0)
+    moved = photograph(scenes.orbit_camera(60.0, size=SIZE))
+    moved = replace(moved, image=moved.image.roll(MOVED, -1), depth=None)
+    prior = prior_of(known, moved.camera, [2, 1, 0])
+    assert ((prior.confidence < 1) & (prior.confidence > 0.999)).any()
+    options = ConfidenceConfig(support=False, reject=False)
+    proposal = propose(known, moved, [2, 1, 0], OneEdge(), options)
+    assert (proposal.view.depth <= 1.02 * prior.depth)[prior.mask].all()
+
+
 def test_support_is_the_share_confirmed_and_the_share_of_edges():
     depth, sure = torch.full((4, 4), 2.0), torch.full((4, 4), 0.8)
     edges = torch.tensor([1, 2, 3, 3]).expand(4, 4).int()
