@@ -1,0 +1,93 @@
+"""What a table is told: its words, its folders, its methods; one line where they are wrong."""
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks.__main__ import main
+from benchmarks.catalogue import Catalogue
+from benchmarks.results import read_results
+from extrap_train.errors import InputError
+from tests.benchmarks.tables import greys_folder, run_greys, write_own
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> Path:
+    return write_own(tmp_path / "own")
+
+
+def test_a_capture_with_too_few_frames_is_named(own: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"apple/0000: has 8 usable frames.*picks 9"):
+        run_greys(own, tmp_path, "captures.frames=8")
+
+
+def test_read_only_output_is_one_line(own: Path, tmp_path: Path) -> None:
+    (tmp_path / "greys").write_text("a file where the folder should be")
+    with pytest.raises(InputError, match="cannot be written"):
+        run_greys(own, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["run", "table2"], "table 'table2' is unknown; did you mean table1?"),
+        (["run", "table1", "methods=[our]"], "method 'our' is unknown; did you mean ours"),
+        (
+            ["run", "table1", "rules.veiws=[3]"],
+            "there is no option rules.veiws; did you mean rules.views",
+        ),
+        (["run", "table1", "rules.pool=many"], "could not be converted to Integer"),
+        (["run", "table1", "--config-dir", "/nowhere"], "/nowhere: no such folder"),
+        (["report", "table1", "output=/nowhere"], "holds no results"),
+        (["verify", "/nowhere"], "holds no results"),
+    ],
+)
+def test_a_wrong_word_is_one_line(
+    words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(words) == 1
+    message = capsys.readouterr().err
+    assert message.startswith("error: ")
+    assert message.count("\n") == 1
+    assert said in message
+
+
+def test_every_table_of_the_package_is_sound() -> None:
+    """Its methods exist, its columns are metrics, its published numbers are complete."""
+    catalogue = Catalogue.with_own()
+    for name in catalogue.names("table"):
+        table = catalogue.table(name)
+        assert table.methods
+        for method in table.methods:
+            assert catalogue.method(method).factory
+        nets = {f"lpips_{net}" for net in table.scoring.lpips}
+        assert {c for c in table.columns if c.startswith("lpips")} == nets
+        assert set(table.draws) <= set(table.rules.draws)
+        if table.reported:
+            content = catalogue.reported(table.reported)
+            for row in content["rows"].values():
+                assert all(len(v) == len(content["metrics"]) for v in row.values())
+
+
+def test_the_readmes_method_runs_as_it_stands(tmp_path: Path) -> None:
+    """The file and the YAML, taken from the text."""
+    text = (Path(__file__).parents[2] / "README.md").read_text()
+    source = text.split("```python\n# mine/blur.py\n")[1].split("```")[0]
+    assert len(source.splitlines()) <= 20
+    yaml = text.split("printf '")[1].split("'")[0].replace("\\n", "\n")
+    own = write_own(tmp_path / "own")
+    (own / "blur.py").write_text(source)
+    (own / "method" / "average.yaml").write_text(yaml)
+    assert run_greys(own, tmp_path / "out", "methods=[average]", quick=True) == 0
+    assert read_results(greys_folder(tmp_path / "out")).cells[0]["status"] == "ok"
+
+
+def test_slurm_takes_the_clusters_options_and_says_where_there_is_none(
+    own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    words = ["run", "greys", "--slurm", "slurm.partition=gpu", "--config-dir", str(own)]
+    assert main([*words, f"output={tmp_path / 'out'}"]) == 1
+    assert "there is no sbatch on this machine" in capsys.readouterr().err
+    assert main([*words, "slurm.partitoin=gpu"]) == 1
+    assert "did you mean slurm.partition" in capsys.readouterr().err
