@@ -16,8 +16,9 @@ from data_prep.filter import judge_all
 from data_prep.frames import frames_key
 from data_prep.split import Split, split_sequences
 from data_prep.tables import Outcome, write_results
+from data_prep.tools import Tools, put_away
 from data_prep.unit import NO_SPACE, Unit, Workshop, prepare_unit
-from extrap_train.config import PrepConfig
+from extrap_train.config import DepthConfig, MatcherConfig, PrepConfig
 from extrap_train.data.files import remove_partial
 from extrap_train.data.frame_files import sequence_folder
 from extrap_train.data.sequences import Sequence
@@ -53,20 +54,20 @@ class _Plan:
         for sequence in self.sequences:
             qualities = [sequence.viewpoint_quality, sequence.point_cloud_quality]
             digest.update(json.dumps([sequence.category, sequence.name, qualities]).encode())
-            frames = frames_key(sequence, shop.depth_source, shop.options.image_size, False)
+            frames = frames_key(sequence, shop.tools.depth, shop.options.image_size, False)
             digest.update(frames.encode())
         return digest.hexdigest()
 
 
 def prepare(
     sequences: ListOf[Sequence],
-    depth_source: DepthSource,
+    depth: DepthConfig | DepthSource,
     options: PrepConfig,
     *,
     test_names: Collection[str] | int,
     folder: Path,
     frames: Path | None = None,
-    matcher: Matcher | None = None,
+    matcher: MatcherConfig | Matcher | None = None,
     launcher: Launcher = HERE,
     progress: bool = True,
     retry: bool = True,
@@ -74,12 +75,13 @@ def prepare(
     """Make pair data from sequences, or open what an equal earlier call has made.
 
     `frames` is the folder of the frames, which calls with other pair options may share; the same
-    as `folder` by default. Training warps are corrected where there is a `matcher`. A sequence that
+    as `folder` by default. Training warps are corrected where there is a `matcher`. Options of both
+    are made to tools where the jobs run; ready tools go along with the jobs. A sequence that
     cannot be used is dropped with its reason, and tried again by the next call unless `retry` is
     False. Finished sequences are kept whatever ends the call. Raises InputError where no sequence
     is left, or the disk is full.
     """
-    shop = Workshop(depth_source, options, matcher, frames or folder, folder)
+    shop = Workshop(Tools(depth, matcher), options, frames or folder, folder)
     plan = _Plan(sequences, shop, test_names)
     key = plan.key
     if _is_finished(folder, key, retry):
@@ -95,6 +97,8 @@ def prepare(
         if error.errno not in NO_SPACE:
             raise
         raise InputError(_disk_full(folder, sequences, options)) from None
+    finally:
+        put_away()
     return PreparedData.open(folder)
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from data_prep.split import held_out
+from extrap_train.config import DepthConfig
 from extrap_train.data.frame_files import SequenceFrames
 from extrap_train.data.images import to_eight_bits
 from extrap_train.data.sequences import Sequence
@@ -25,9 +26,11 @@ MOST_UNUSABLE_SHARE = 0.1
 LOG = logging.getLogger(__name__)
 
 
-def frames_key(sequence: Sequence, depth_source: DepthSource, image_size: int, lone: bool) -> str:
+def frames_key(
+    sequence: Sequence, depth: DepthConfig | DepthSource, image_size: int, lone: bool
+) -> str:
     """A hash of what frames are made from: options, names and cameras, not the files' bytes."""
-    digest = hashlib.sha256(json.dumps([image_size, repr(depth_source), lone]).encode())
+    digest = hashlib.sha256(json.dumps([image_size, repr(depth), lone]).encode())
     for frame in sequence.frames:
         traits = [frame.name, frame.camera.height, frame.camera.width, frame.has_depth]
         digest.update(json.dumps([*traits, frame.has_mask]).encode())

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 from data_prep.correct import correct_pair
 from data_prep.select import select_pairs
 from data_prep.split import held_out
+from data_prep.tools import Tools
 from extrap_train.config import PrepConfig
 from extrap_train.data.frame_files import FLOWS, StoredFrames, sequence_folder
 from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
@@ -142,11 +143,11 @@ def make_pairs(
     name: str,
     role: str,
     options: PrepConfig,
-    matcher: Matcher | None,
+    tools: Tools,
 ) -> None:
     """Choose and correct a sequence's pairs, unless they are there already."""
     if files.read() is not None:
         return
     with torch.inference_mode():
         chosen = choose_pairs(frames, name, role, options)
-        files.write(*correct_pairs(frames, chosen, matcher, options.correction_grid))
+        files.write(*correct_pairs(frames, chosen, tools.matcher(), options.correction_grid))

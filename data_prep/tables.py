@@ -65,7 +65,7 @@ def write_results(shop: Workshop, outcomes: list[Outcome], split: Split, key: st
         "format": FORMAT,
         "key": key,
         "options": asdict(shop.options),
-        "correction": None if shop.matcher is None else repr(shop.matcher),
+        "correction": None if shop.tools.correction is None else repr(shop.tools.correction),
         "frames": os.path.relpath(shop.frames, folder),
         "split": json.loads(split.to_json())["sha256"],
         "sequences": {

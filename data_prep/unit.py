@@ -13,6 +13,7 @@ from pathlib import Path
 from data_prep.correct import METHOD
 from data_prep.frames import frames_key, make_frames
 from data_prep.pairs import PairFiles, make_pairs
+from data_prep.tools import Tools
 from extrap_train.config import PrepConfig
 from extrap_train.data.frame_files import (
     StoredFrames,
@@ -21,9 +22,7 @@ from extrap_train.data.frame_files import (
     write_frames,
 )
 from extrap_train.data.sequences import Sequence
-from extrap_train.depth import DepthSource
 from extrap_train.errors import InputError
-from extrap_train.matching import Matcher
 
 LOG = logging.getLogger(__name__)
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
@@ -34,10 +33,8 @@ NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 class Workshop:
     """What all units of a preparation share; small, because every job takes it along."""
 
-    depth_source: DepthSource
+    tools: Tools
     options: PrepConfig
-    matcher: Matcher | None
-    """What warps are corrected with; None leaves them."""
     frames: Path
     """Root of the frames, which preparations with other pair options share."""
     folder: Path
@@ -46,7 +43,8 @@ class Workshop:
     @property
     def correction(self) -> str:
         """How warps are corrected; empty where they are not."""
-        return "" if self.matcher is None else f"{self.matcher!r}, method {METHOD}"
+        how = self.tools.correction
+        return "" if how is None else f"{how!r}, method {METHOD}"
 
 
 @dataclass(frozen=True)
@@ -67,7 +65,7 @@ class Unit:
     def frames_key(self) -> str:
         """What the frames are made from."""
         shop, lone = self.workshop, self.role == "train and test"
-        return frames_key(self.sequence, shop.depth_source, shop.options.image_size, lone)
+        return frames_key(self.sequence, shop.tools.depth, shop.options.image_size, lone)
 
     @property
     def frames_folder(self) -> Path:
@@ -107,9 +105,10 @@ def _prepare(unit: Unit) -> None:
     table = read_camera_table(unit.frames_folder, key)
     if table is None:
         lone = unit.role == "train and test"
-        frames = make_frames(unit.sequence, shop.depth_source, shop.options.image_size, lone)
+        source = shop.tools.depth_source()
+        frames = make_frames(unit.sequence, source, shop.options.image_size, lone)
         write_frames(unit.frames_folder, frames, key)
         table = read_camera_table(unit.frames_folder, key)
         assert table is not None
     stored = StoredFrames.open(unit.frames_folder, table)
-    make_pairs(unit.pair_files, stored, unit.name, unit.role, shop.options, shop.matcher)
+    make_pairs(unit.pair_files, stored, unit.name, unit.role, shop.options, shop.tools)

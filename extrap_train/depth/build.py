@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import torch
+
 from extrap_train.config import (
     DatasetDepthConfig,
     DepthConfig,
@@ -21,11 +23,12 @@ from extrap_train.errors import InputError
 from extrap_train.matching.build import matcher
 
 
-def depth_source(config: DepthConfig) -> DepthSource:
+def depth_source(config: DepthConfig, device: torch.device | None = None) -> DepthSource:
     """The source that the type of `config` stands for; InputError where its weights cannot be used.
 
-    A network runs on the GPU where there is one.
+    A network runs on `device`; by default on the GPU where there is one.
     """
+    device = device or fastest_device()
     match config:
         case DatasetDepthConfig():
             return DatasetDepth()
@@ -33,13 +36,14 @@ def depth_source(config: DepthConfig) -> DepthSource:
             return PlaneSweepStereo(config)
         case Mast3rConfig():
             path = required_file(config.checkpoint, "depth.checkpoint", config.weights)
-            return Mast3rDepth(config, read_network(Path(path)).to(fastest_device()))
+            return Mast3rDepth(config, read_network(Path(path)).to(device))
         case MonocularConfig():
             # transformers takes seconds to load: only where it is wanted.
             from extrap_train.depth.depth_anything import read_depth_anything
 
-            network = read_depth_anything(config.model)
-            return MonocularDepth(config, network, matcher(config.matcher, "depth.matcher"))
+            network = read_depth_anything(config.model, device)
+            found = matcher(config.matcher, "depth.matcher", device)
+            return MonocularDepth(config, network, found)
         case _:
             raise InputError(
                 f"depth={config.name}: unknown; choose dataset, stereo, mast3r or monocular"

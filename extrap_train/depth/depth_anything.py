@@ -43,10 +43,11 @@ class DepthAnything:
         return resized[0, 0].to(image)
 
 
-def read_depth_anything(model: str) -> DepthAnything:
+def read_depth_anything(model: str, device: torch.device | None = None) -> DepthAnything:
     """The model in a folder, or of that name in the cache of downloads; nothing is downloaded.
 
-    Weights are read from safetensors alone. InputError where it is absent or another model.
+    Weights are read from safetensors alone. It runs on `device`, by default on the GPU where there
+    is one. InputError where it is absent or another model.
     """
     try:
         kind = AutoConfig.from_pretrained(model, local_files_only=True).model_type
@@ -68,7 +69,7 @@ def read_depth_anything(model: str) -> DepthAnything:
         if said.get(problem):
             names = sorted(map(str, said[problem]))
             raise _refusal(model, f"has {len(names)} {problem.replace('_', ' ')} ({names[0]})")
-    network = network.eval().requires_grad_(False).to(fastest_device())
+    network = network.eval().requires_grad_(False).to(device or fastest_device())
     return DepthAnything(network, processor, int(processor.size["height"]))
 
 

@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import torch
+
 from extrap_train.config import (
     AlikedMatcherConfig,
     FlowMatcherConfig,
@@ -17,20 +19,24 @@ from extrap_train.matching.flow import FlowMatcher
 from extrap_train.matching.loftr import LoftrMatcher, read_loftr
 
 
-def matcher(config: MatcherConfig, option: str = "matcher") -> Matcher:
+def matcher(
+    config: MatcherConfig, option: str = "matcher", device: torch.device | None = None
+) -> Matcher:
     """The matcher that the type of `config`, given as `option`, stands for.
 
-    A network runs on the GPU where there is one. InputError where its weights cannot be used.
+    A network runs on `device`, by default on the GPU where there is one. InputError where its
+    weights cannot be used.
     """
+    device = device or fastest_device()
     match config:
         case FlowMatcherConfig():
             return FlowMatcher(config)
         case LoftrMatcherConfig():
             loftr = read_loftr(_weights(config, option), config, f"{option}.checkpoint")
-            return LoftrMatcher(config, loftr.to(fastest_device()))
+            return LoftrMatcher(config, loftr.to(device))
         case AlikedMatcherConfig():
             aliked = read_aliked(_weights(config, option), config, f"{option}.checkpoint")
-            return AlikedMatcher(config, aliked.to(fastest_device()))
+            return AlikedMatcher(config, aliked.to(device))
         case _:
             raise InputError(f"{option}={config.name}: unknown; choose flow, loftr or aliked")
 

@@ -14,6 +14,7 @@ from filelock import FileLock, Timeout
 
 from data_prep.build import prepare
 from data_prep.synthesize import synthesize
+from data_prep.tools import Tools
 from extrap_train.config import (
     Co3dConfig,
     DataConfig,
@@ -28,10 +29,8 @@ from extrap_train.config import (
 from extrap_train.data.co3d import read_category
 from extrap_train.data.sequences import Sequence
 from extrap_train.data.store import PreparedData
-from extrap_train.depth.build import depth_source
 from extrap_train.jobs import Launcher
 from extrap_train.jobs.build import open_launcher
-from extrap_train.matching.build import matcher as build_matcher
 
 LOCAL = LocalConfig()
 
@@ -52,9 +51,10 @@ def prepare_category(
 
     With `retry`, sequences that failed before are tried again.
     """
-    correct = is_corrected(data, depth, prep)
+    how = matcher if is_corrected(data, depth, prep) else None
+    Tools(depth, how).check()  # before anything is rendered
     made_from = [category, asdict(data), asdict(depth)]
-    digest = _digest([*made_from, asdict(prep), asdict(matcher) if correct else None])
+    digest = _digest([*made_from, asdict(prep), asdict(how) if how else None])
     folder = output / "data" / f"{category}-{digest}"
     frames = output / "frames" / f"{category}-{_digest([*made_from, prep.image_size])}"
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -65,12 +65,12 @@ def prepare_category(
         sequences, test_names = _sequences(category, data, output, opened)
         return prepare(
             sequences,
-            depth_source(depth),
+            depth,
             prep,
             test_names=test_names,
             folder=folder,
             frames=frames,
-            matcher=build_matcher(matcher) if correct else None,
+            matcher=how,
             launcher=opened,
             retry=retry,
         )

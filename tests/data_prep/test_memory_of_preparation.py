@@ -18,12 +18,12 @@ from typing import Any
 import pytest
 from captures import frame_entries, write_capture
 
+from data_prep.tools import Tools
 from data_prep.unit import Unit, Workshop
-from extrap_train.config import PrepConfig
+from extrap_train.config import DatasetDepthConfig, PrepConfig
 from extrap_train.data import co3d, json_files
 from extrap_train.data.co3d import read_category
 from extrap_train.data.sequences import Sequence
-from extrap_train.depth.dataset import DatasetDepth
 
 FRAMES = 20
 MOST_BYTES_A_FRAME = 1000
@@ -81,7 +81,7 @@ def test_what_is_kept_of_a_frame_is_small(
 
 
 def test_a_job_takes_its_own_sequence_along_and_no_other(photographs: Path) -> None:
-    shop = Workshop(DatasetDepth(), PrepConfig(), None, photographs, photographs)
+    shop = Workshop(Tools(DatasetDepthConfig(), None), PrepConfig(), photographs, photographs)
 
     def job(sequences: list[Sequence]) -> int:
         return len(pickle.dumps(Unit(shop, sequences[0], "train")))

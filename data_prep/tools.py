@@ -1,0 +1,68 @@
+"""By what frames and corrections are made: options travel to jobs, networks stay where they run.
+
+A network that is sent to another process takes a file descriptor a tensor along, and a job that
+waits keeps them: a few jobs of MASt3R's nine hundred tensors are more than a process may have open.
+"""
+
+import pickle
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TypeVar
+
+import torch
+
+from extrap_train.config import DepthConfig, MatcherConfig
+from extrap_train.depth import DepthSource
+from extrap_train.depth.build import depth_source
+from extrap_train.matching import Matcher
+from extrap_train.matching.build import matcher
+
+Options = TypeVar("Options")
+Tool = TypeVar("Tool")
+
+
+@dataclass(frozen=True)
+class Tools:
+    """A depth source and a matcher: options, from which every process makes its own, once.
+
+    A ready one is used as it is, and goes along with every job: none that holds a network.
+    """
+
+    depth: DepthConfig | DepthSource
+    correction: MatcherConfig | Matcher | None
+    """What warps are corrected with; None leaves them."""
+
+    def depth_source(self) -> DepthSource:
+        """On the GPU of this process, where it has one."""
+        return (
+            _made(depth_source, self.depth) if isinstance(self.depth, DepthConfig) else self.depth
+        )
+
+    def matcher(self) -> Matcher | None:
+        """On the GPU of this process, where it has one."""
+        how = self.correction
+        return _made(matcher, how) if isinstance(how, MatcherConfig) else how
+
+    def check(self) -> None:
+        """Raises InputError where weights cannot be used, without taking a GPU's memory."""
+        cpu = torch.device("cpu")
+        if isinstance(self.depth, DepthConfig):
+            depth_source(self.depth, cpu)
+        if isinstance(self.correction, MatcherConfig):
+            matcher(self.correction, device=cpu)
+
+
+def put_away() -> None:
+    """Let go of what this process has made: training wants the memory."""
+    _made_once.cache_clear()
+
+
+def _made(make: Callable[[Options], Tool], options: Options) -> Tool:
+    return _made_once(make, pickle.dumps(options))
+
+
+@lru_cache(maxsize=2)
+def _made_once(make: Callable[[Options], Tool], options: bytes) -> Tool:
+    """By the options' bytes, because options can be changed and so cannot be looked up."""
+    return make(pickle.loads(options))

@@ -1,0 +1,114 @@
+"""Networks are made where they run: what a job takes along is small and holds nothing open.
+
+`python -m pytest -m slow tests/data_prep/test_tools.py` prepares with a network in two processes
+that may have few files open.
+"""
+
+import argparse
+import pickle
+import shlex
+import subprocess
+import sys
+from multiprocessing.reduction import ForkingPickler
+from pathlib import Path
+
+import pytest
+import torch
+from captures import write_capture
+from kornia.feature import LoFTR
+
+from data_prep.tools import Tools, put_away
+from data_prep.unit import Unit, Workshop
+from extrap_train.config import (
+    LoftrMatcherConfig,
+    Mast3rConfig,
+    PrepConfig,
+    SyntheticConfig,
+)
+from extrap_train.data.sequences import Sequence
+from extrap_train.data.store import PreparedData
+from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth.mast3r.network import Architecture, PointMapNetwork
+from extrap_train.errors import InputError
+from extrap_train.tasks.prepare import prepare_category
+
+THIN = Architecture(
+    encoder_width=16, encoder_heads=2, decoder_width=8, decoder_heads=2, descriptor_width=1
+)
+"""As deep as the published network, so with as many tensors."""
+FEW = 256
+
+
+def open_files() -> int:
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+@pytest.fixture(scope="module")
+def mast3r(tmp_path_factory: pytest.TempPathFactory) -> Mast3rConfig:
+    file = tmp_path_factory.mktemp("weights") / "thin.pth"
+    heads = argparse.Namespace(model="Network(enc_num_heads=2, dec_num_heads=2)")
+    torch.save({"args": heads, "model": PointMapNetwork(THIN).state_dict()}, file)
+    return Mast3rConfig(checkpoint=str(file))
+
+
+def test_a_job_is_small_and_keeps_no_file_open(mast3r: Mast3rConfig, tmp_path: Path) -> None:
+    tools = Tools(mast3r, LoftrMatcherConfig(checkpoint="loftr.ckpt"))
+    shop = Workshop(tools, PrepConfig(), tmp_path, tmp_path)
+    before = open_files()
+    job = ForkingPickler.dumps(Unit(shop, Sequence("cup", "one", ()), "train"))
+    assert open_files() == before
+    assert len(job) < 2000
+
+
+def test_a_process_makes_its_tools_once_and_can_let_go_of_them(mast3r: Mast3rConfig) -> None:
+    tools = Tools(mast3r, None)
+    first = tools.depth_source()
+    assert pickle.loads(pickle.dumps(tools)).depth_source() is first
+    assert tools.matcher() is None
+    put_away()
+    assert tools.depth_source() is not first
+    put_away()
+    ready = DatasetDepth()
+    assert Tools(ready, None).depth_source() is ready
+
+
+def test_weights_that_cannot_be_used_are_refused_before_anything_is_rendered(
+    tmp_path: Path,
+) -> None:
+    with pytest.raises(InputError, match=r"no\.pth: there is no such file; give depth.checkpoint"):
+        prepare_category(
+            "hydrant",
+            SyntheticConfig(frames=2, image_size=8),
+            Mast3rConfig(checkpoint=str(tmp_path / "no.pth")),
+            PrepConfig(image_size=8),
+            output=tmp_path / "outputs",
+            workers=1,
+            matcher=LoftrMatcherConfig(),
+        )
+    assert not (tmp_path / "outputs").exists()
+
+
+@pytest.mark.slow
+def test_two_processes_with_a_network_need_few_open_files(tmp_path: Path) -> None:
+    write_capture(tmp_path / "co3d", ("one", "two", "three", "four", "five"), 8, step_deg=45)
+    weights = tmp_path / "loftr.ckpt"
+    torch.save({"state_dict": LoFTR(pretrained=None).state_dict()}, weights)
+    options = [
+        "category=cup",
+        "data=co3d",
+        f"data.root={tmp_path / 'co3d'}",
+        f"output={tmp_path / 'outputs'}",
+        "prep.image_size=16",
+        "prep.max_gap_deg=60",
+        "prep.max_uses=2",
+        "matcher=loftr",
+        "matcher.image_size=32",
+        f"matcher.checkpoint={weights}",
+        "workers=2",
+    ]
+    command = shlex.join([sys.executable, "-m", "data_prep", *options])
+    script = f"ulimit -n {FEW}; exec {command}"
+    subprocess.run(["bash", "-c", script], check=True, timeout=200)
+    (folder,) = (tmp_path / "outputs" / "data").glob("cup-*")
+    assert len(LoFTR(pretrained=None).state_dict()) * 2 > FEW, "or two waiting jobs would fit"
+    assert PreparedData.open(folder).manifest["sequences"]["kept"] == 5
