@@ -103,7 +103,7 @@ def prepare(
 
 
 def _remove_partial(shop: Workshop, sequences: ListOf[Sequence]) -> None:
-    """What killed runs have left half-written; all units are done, so nobody writes there now."""
+    """What killed runs have left half-written."""
     remove_partial(shop.folder)
     for category in {sequence.category for sequence in sequences}:
         for root, kind in ((shop.frames, "frames"), (shop.folder, "pairs")):

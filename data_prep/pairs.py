@@ -2,8 +2,6 @@
 
 import hashlib
 import json
-import shutil
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +17,7 @@ from data_prep.select import select_pairs
 from data_prep.split import held_out
 from data_prep.tools import Tools
 from extrap_train.config import PrepConfig
+from extrap_train.data.files import whole_folder
 from extrap_train.data.frame_files import FLOWS, StoredFrames, sequence_folder
 from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
 from extrap_train.matching import Matcher
@@ -63,20 +62,10 @@ class PairFiles:
 
     def write(self, pairs: pd.DataFrame, flows: Float[np.ndarray, "m 2 g g"]) -> None:
         """Both files, whole or not at all."""
-        self.folder.parent.mkdir(parents=True, exist_ok=True)
-        made = Path(
-            tempfile.mkdtemp(prefix=f".{self.folder.name}.", suffix=".tmp", dir=self.folder.parent)
-        )
-        try:
+        with whole_folder(self.folder, lambda _: self.read() is not None) as made:
             np.save(made / FLOWS, flows.astype(np.float16))
             table = pa.Table.from_pandas(pairs, preserve_index=False)
             pq.write_table(table.replace_schema_metadata({_KEY: self.key.encode()}), made / TABLE)
-            made.chmod(0o755)
-            if self.folder.exists():
-                shutil.rmtree(self.folder)
-            made.rename(self.folder)
-        finally:
-            shutil.rmtree(made, ignore_errors=True)
 
 
 def reference_frames(depth_share: Float[np.ndarray, "n"], lone: bool) -> Bool[np.ndarray, "n"]:

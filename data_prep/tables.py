@@ -18,7 +18,7 @@ from data_prep.filter import Verdict
 from data_prep.pairs import reference_frames
 from data_prep.split import Split
 from data_prep.unit import Unit, Workshop
-from extrap_train.data.files import write_whole
+from extrap_train.data.files import partial_beside, write_whole
 from extrap_train.data.frame_files import read_camera_table
 from extrap_train.data.sequences import Sequence
 from extrap_train.data.store import FORMAT
@@ -153,7 +153,7 @@ class _Rows:
 @contextmanager
 def _writer(file: Path) -> Iterator[Any]:
     """A function that takes the rows of `file`, which is there whole or not at all."""
-    temporary = file.with_name(f".{file.name}.tmp")
+    temporary = partial_beside(file)
     rows = _Rows(temporary)
     try:
         yield rows.add

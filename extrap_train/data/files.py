@@ -3,12 +3,21 @@
 import os
 import re
 import shutil
+import socket
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+from filelock import FileLock
 
 from extrap_train.errors import InputError
 
 MAX_NAME_BYTES = 255
 """Of a file or folder, on every common file system."""
+_WRITER = re.compile(r"\.(?P<host>[^.]+)-(?P<pid>\d+)(\.[^.]+)?\.tmp$")
+_ABANDONED_S = 24 * 3600.0
 
 # Absolute, on a Windows drive, with a `..` among its parts, or with a NUL that would end it early.
 _LEAVES_FOLDER = re.compile(r"^[/\\]|^[A-Za-z]:|(^|[/\\])\.\.([/\\]|$)|\0")
@@ -56,9 +65,14 @@ def resolve_inside(root: Path, relative: str) -> Path:
     return resolved
 
 
+def partial_beside(path: Path) -> Path:
+    """Where this process writes what is to become `path`; says whose it is (`remove_partial`)."""
+    return path.with_name(f".{path.name}.{_host()}-{os.getpid()}.tmp")
+
+
 def write_whole(path: Path, content: bytes) -> None:
     """Write a file so that it is there complete or not at all; makes the folders above it."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = partial_beside(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -72,13 +86,70 @@ def write_whole(path: Path, content: bytes) -> None:
         ) from None
 
 
+@contextmanager
+def whole_folder(folder: Path, is_wanted: Callable[[Path], bool]) -> Iterator[Path]:
+    """A folder to write into, which becomes `folder` at the end, or leaves nothing behind.
+
+    What lay there is replaced, unless it is what is wanted: then another writer has come first, and
+    its folder stays, so that nobody who reads it by now is disturbed.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    own = partial_beside(folder)
+    made = Path(tempfile.mkdtemp(prefix=f"{own.stem}.", suffix=own.suffix, dir=folder.parent))
+    try:
+        yield made
+        made.chmod(0o755)  # mkdtemp's folders are closed to everyone else
+        for path in (*made.rglob("*"), made):
+            _sync(path)
+        with FileLock(folder.parent / ".lock"):
+            if is_wanted(folder):
+                return
+            if folder.exists():
+                shutil.rmtree(folder)
+            made.rename(folder)
+            _sync(folder.parent)
+    finally:
+        shutil.rmtree(made, ignore_errors=True)
+
+
 def remove_partial(folder: Path) -> None:
     """Remove the `.*.tmp` that killed writers have left in a folder, which need not exist.
 
-    Whoever calls this must know that nobody is writing there.
+    What another process that lives still writes is left alone; of one on another machine it is
+    removed after a day. This process must not be writing there.
     """
     for path in folder.glob(".*.tmp"):
+        if _is_being_written(path):
+            continue
         if path.is_dir():
             shutil.rmtree(path)
         else:
             path.unlink()
+
+
+def _is_being_written(path: Path) -> bool:
+    writer = _WRITER.search(path.name)
+    if writer is None or writer["pid"] == str(os.getpid()):
+        return False
+    if writer["host"] != _host():
+        return time.time() - max(p.stat().st_mtime for p in (path, *path.rglob("*"))) < _ABANDONED_S
+    try:
+        os.kill(int(writer["pid"]), 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass  # somebody else's, and alive
+    return True
+
+
+def _host() -> str:
+    return socket.gethostname().partition(".")[0]
+
+
+def _sync(path: Path) -> None:
+    """Bring a file or a folder's list of names to the disk: a name must not outlive its content."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -2,8 +2,6 @@
 
 import math
 import re
-import shutil
-import tempfile
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -15,6 +13,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from extrap_train.data.files import whole_folder
 from extrap_train.views import Camera
 
 FLOWS = "flows.npy"
@@ -93,22 +92,14 @@ def write_frames(folder: Path, frames: SequenceFrames, key: str) -> None:
     Depth is stored as float16, divided by a power of two near its median: exact for every scene
     unit, relative precision 2⁻¹¹; what is more than 65,504 medians away becomes unknown.
     """
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".tmp", dir=folder.parent))
-    try:
-        scale = _depth_scale(frames.depths)
-        scaled = frames.depths / scale
-        scaled[scaled > np.finfo(np.float16).max] = 0
-        np.save(temporary / IMAGES, frames.images)
-        np.save(temporary / DEPTHS, scaled.astype(np.float16))
-        np.save(temporary / MASKS, frames.masks)
-        pq.write_table(_camera_table(frames, scale, key), temporary / CAMERAS)
-        temporary.chmod(0o755)  # mkdtemp's folders are closed to everyone else
-        if folder.exists():
-            shutil.rmtree(folder)
-        temporary.rename(folder)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    scale = _depth_scale(frames.depths)
+    scaled = frames.depths / scale
+    scaled[scaled > np.finfo(np.float16).max] = 0
+    with whole_folder(folder, lambda there: read_camera_table(there, key) is not None) as made:
+        np.save(made / IMAGES, frames.images)
+        np.save(made / DEPTHS, scaled.astype(np.float16))
+        np.save(made / MASKS, frames.masks)
+        pq.write_table(_camera_table(frames, scale, key), made / CAMERAS)
 
 
 def read_camera_table(folder: Path, key: str) -> pa.Table | None:

@@ -1,9 +1,20 @@
 import errno
+import multiprocessing
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from extrap_train.data.files import check_relative, resolve_inside, write_whole
+from extrap_train.data.files import (
+    check_relative,
+    partial_beside,
+    remove_partial,
+    resolve_inside,
+    whole_folder,
+    write_whole,
+)
 from extrap_train.errors import InputError
 
 
@@ -73,3 +84,69 @@ def test_a_full_disk_leaves_the_old_file_and_says_so(tmp_path, monkeypatch):
         write_whole(file, b"newer")
     assert file.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [file]
+
+
+def write_number(folder: Path, number: int, is_wanted=lambda there: False) -> None:
+    with whole_folder(folder, is_wanted) as made:
+        (made / "number").write_text(str(number))
+
+
+class Unwritable:
+    def __str__(self) -> str:
+        raise ValueError("half")
+
+
+def test_a_folder_is_there_whole_or_not_at_all(tmp_path):
+    folder = tmp_path / "deep" / "one"
+    with pytest.raises(ValueError, match="half"):
+        write_number(folder, Unwritable())
+    assert not folder.exists()
+    assert list(folder.parent.iterdir()) == []
+    write_number(folder, 1)
+    write_number(folder, 2)
+    assert (folder / "number").read_text() == "2"
+    assert {path.name for path in folder.parent.iterdir()} == {"one", ".lock"}
+
+
+def test_who_comes_second_leaves_the_first_ones_folder(tmp_path):
+    folder = tmp_path / "one"
+    write_number(folder, 1)
+    before = folder.stat().st_ino
+    write_number(folder, 1, lambda there: (there / "number").read_text() == "1")
+    assert folder.stat().st_ino == before
+    assert {path.name for path in tmp_path.iterdir()} == {"one", ".lock"}
+
+
+def write_many(folder: Path) -> None:
+    for _ in range(30):
+        write_number(folder, 1)
+        write_number(folder, 1, lambda there: (there / "number").exists())
+
+
+def test_processes_that_write_one_folder_do_not_collide(tmp_path):
+    # Forked: they only write files, and start at once.
+    context = multiprocessing.get_context("fork")
+    writers = [context.Process(target=write_many, args=(tmp_path / "one",)) for _ in range(2)]
+    for writer in writers:
+        writer.start()
+    for writer in writers:
+        writer.join()
+    assert [writer.exitcode for writer in writers] == [0, 0]
+    assert (tmp_path / "one" / "number").read_text() == "1"
+
+
+def test_only_what_nobody_writes_any_more_is_removed(tmp_path):
+    living = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    own = partial_beside(tmp_path / "own").name
+    name = {who: own.replace(f"-{os.getpid()}.", f"-{who}.") for who in (living.pid, dead.pid)}
+    elsewhere, long_ago = ".one.other_host-7.abc.tmp", ".two.other_host-7.abc.tmp"
+    for folder in (own, *name.values(), elsewhere, long_ago, ".from_before.tmp"):
+        (tmp_path / folder).mkdir()
+    os.utime(tmp_path / long_ago, (0, 0))
+    remove_partial(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {name[living.pid], elsewhere}
+    living.communicate()
+    remove_partial(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {elsewhere}
