@@ -4,9 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from benchmarks.methods.gaussians.density import remove
 from benchmarks.methods.gaussians.depth_losses import (
     edge_aware_smoothness,
     filled,
@@ -15,37 +16,33 @@ from benchmarks.methods.gaussians.depth_losses import (
 from benchmarks.methods.gaussians.drawing import Drawing, draw
 from benchmarks.methods.gaussians.gaussians import Gaussians
 from benchmarks.methods.gaussians.method import GaussianMethod
+from benchmarks.methods.gaussians.nearest import nearest_expected
 from benchmarks.methods.gaussians.neural_colour import HashGrid, NeuralColor
 from benchmarks.methods.gaussians.parameters import GaussianParameters
 from benchmarks.methods.gaussians.priors import monocular_source, prior_depths
 from benchmarks.methods.gaussians.recipe import Objective, Recipe, Step, Training
 from benchmarks.methods.gaussians.scene import TrainingScene
+from benchmarks.methods.gaussians.schedule import LEAST_BETWEEN_GROWTH
 from extrap_train.views import Camera
 
 _OPAQUE = 0.2
 """Opacities above are pulled to 1, those below, as in the released code, too."""
-_REMEMBERED = 0.6
-"""Share of the running mean that stays when another hard loss comes in."""
 
 
 @dataclass(frozen=True)
 class DnGaussian(GaussianMethod):
     """Random points, moved by depth first.
 
-    Published values are those for DTU, whose cameras too look at one object, but for the patches'
-    sides, which are LLFF's: DTU's (17 to 53) are for photographs of 400 pixels.
+    Published values are those for Blender's scenes, whose cameras too stand around an object.
+    Two things differ: depth steps are taken in every iteration, not every tenth, and what stands
+    right before a camera is removed as in the released training for LLFF.
     """
 
     full_iterations: int = 6000
     init: str = "random"
     l1_weight: float = 1.0
-    ssim_weight: float = 0.6
-    means_rate: float = 1.6e-3
-    means_rate_final: float = 1.6e-5
-    log_scales_rate: float = 3e-3
     densify_until: int = 6000
-    densify_gradient: float = 1e-3
-    split_scale: float = 0.1
+    densify_gradient: float = 5e-4
     densify_least_opacity: float = 0.1
     prune_opacity: float = 0.01
     reset_every: int = 0
@@ -54,21 +51,24 @@ class DnGaussian(GaussianMethod):
     """Where monocular depth comes from: `surrogate` or `depth_source`."""
     hard_opacity: float = 0.95
     soft_from: int = 1000
-    soft_below: float = 0.1
-    """Soft steps are taken only while the running mean of the hard loss is below (DTU): opacities
-    have nothing to learn from depth before means have.
-    """
     smooth_from: int = 3000
     local_weight: float = 0.1
     global_weight: float = 1.0
     smooth_weight: float = 0.0
-    """Of edge-aware smoothness. Published: 0.1 for LLFF, none for DTU."""
+    """Of edge-aware smoothness. Published: 0.1 for LLFF, none for others."""
     depth_tolerance: float = 0.01
     patch_range: tuple[int, int] = (5, 17)
     """Least and greatest side of a patch in pixels; each term draws its own."""
-    shape_weight: float = 0.005
-    scale_weight: float = 0.005
-    opacity_weight: float = 0.001
+    shape_weight: float = 0.0
+    """Of round, of small, and of either opaque or transparent Gaussians. Published: none for
+    Blender, 0.002, 0.001 and 0.001 for LLFF.
+    """
+    scale_weight: float = 0.0
+    opacity_weight: float = 0.0
+    clear_every: int = 25
+    """Iterations after which Gaussians right before a camera, and unseen ones, are removed: patches
+    know no absolute depth, and a shell there satisfies them all.
+    """
 
     color: str = "neural"
     """`neural` (hash grid and networks) or `sh` (spherical harmonics)."""
@@ -109,7 +109,10 @@ class DnGaussianRecipe(Recipe):
                     )
                 )
         scene.record["color"] = options.color
-        self._hard_loss = 1.0  # of depth that has nothing to do with the prior, about
+        self._cameras = [view.camera for view in scene.views]
+        self._nearest_expected = nearest_expected(self._cameras)
+        nearest = float(self._nearest_expected.min())
+        scene.record["nearest"] = f"{nearest:.2f} extents from the inputs" if nearest else "unknown"
         self._soft_steps = 0
 
     def modules(self) -> Sequence[tuple[nn.Module, float, float]]:
@@ -132,9 +135,9 @@ class DnGaussianRecipe(Recipe):
         return self._neural(means, directions)
 
     def steps(self, training: Training) -> Sequence[Step]:
-        """Hard depth, once that is near its prior soft depth, and the photograph."""
+        """Hard depth, later on soft depth, and the photograph."""
         late = training.iteration > training.schedule.at(self.options.soft_from)
-        soft = (self._soft_step,) if late and self._hard_loss < self.options.soft_below else ()
+        soft = (self._soft_step,) if late else ()
         self._soft_steps += len(soft)
         self.scene.record["soft depth"] = f"in {self._soft_steps} iterations"
         return (self._hard_step, *soft, self.photometric_step)
@@ -144,6 +147,8 @@ class DnGaussianRecipe(Recipe):
     ) -> Float[Tensor, ""] | float:
         """Round, small, and either opaque or not (as coded: rather opaque)."""
         options, now = self.options, training.optimiser.parameters
+        if not (options.shape_weight or options.scale_weight or options.opacity_weight):
+            return 0.0
         scales, opacities = now.scales, now.opacities
         high = opacities > _OPAQUE
         away = torch.where(high, -opacities.square(), 0).sum() / high.sum().clamp_min(1)
@@ -154,13 +159,30 @@ class DnGaussianRecipe(Recipe):
             + options.opacity_weight * (1 + away + low)
         )
 
+    def adapt(self, training: Training) -> None:
+        """As 3DGS; every while, nothing is left right before an input, or unseen by all of them."""
+        super().adapt(training)
+        every = self.options.clear_every
+        if training.schedule.due(training.iteration, 0, every, LEAST_BETWEEN_GROWTH):
+            unwanted = self._misplaced(training.optimiser.parameters)
+            remove(training.optimiser, training.statistics, unwanted)
+
+    @torch.no_grad()
+    def _misplaced(self, parameters: GaussianParameters) -> Bool[Tensor, "n"]:
+        before = torch.zeros(len(parameters), dtype=torch.bool)
+        seen = before.clone()
+        for camera, nearest in zip(self._cameras, self._nearest_expected, strict=True):
+            drawn = self.draw(parameters, camera).radii[0].amax(-1) > 0
+            depth = parameters.means @ camera.world_to_cam[2, :3] + camera.world_to_cam[2, 3]
+            before |= drawn & (depth < nearest)
+            seen |= drawn
+        return before | ~seen
+
     def _hard_step(self, training: Training, index: int) -> Objective:
         now = training.optimiser.parameters.gaussians()
         opaque = torch.full_like(now.opacities, self.options.hard_opacity)
         shown = replace(now, opacities=opaque, scales=now.scales.detach(), quats=now.quats.detach())
-        loss = self._depth_loss(training, index, shown)
-        self._hard_loss = _REMEMBERED * self._hard_loss + (1 - _REMEMBERED) * float(loss.detach())
-        return Objective(loss)
+        return Objective(self._depth_loss(training, index, shown))
 
     def _soft_step(self, training: Training, index: int) -> Objective:
         now = training.optimiser.parameters.gaussians()

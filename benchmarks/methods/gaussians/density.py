@@ -121,17 +121,24 @@ def prune(
     options: GaussianOptions,
     large_too: bool,
 ) -> None:
-    """Remove what is nearly transparent and, where `large_too`, what is far too large.
-
-    The most opaque Gaussian stays.
-    """
+    """Remove what is nearly transparent and, where `large_too`, what is far too large."""
     now = optimiser.parameters
     useless = now.opacities < options.prune_opacity
     if large_too:
         useless |= now.scales.amax(1) > options.prune_scale
-    useless[now.opacities.argmax()] = False
-    optimiser.keep(~useless)
-    statistics.follow(~useless, 0)
+    remove(optimiser, statistics, useless)
+
+
+@torch.no_grad()
+def remove(
+    optimiser: GaussianOptimiser, statistics: GrowthStatistics, unwanted: Bool[Tensor, "n"]
+) -> None:
+    """Remove these Gaussians; if that were all of them, the most opaque one stays."""
+    kept = ~unwanted
+    if not kept.any():
+        kept[optimiser.parameters.opacities.argmax()] = True
+    optimiser.keep(kept)
+    statistics.follow(kept, 0)
 
 
 @torch.no_grad()

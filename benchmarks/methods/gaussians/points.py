@@ -7,12 +7,15 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from benchmarks.methods.gaussians.nearest import nearest_expected
 from extrap_train.depth import DepthMap
 from extrap_train.geometry.cameras import unproject_to_world
 from extrap_train.views import Camera, View
 
-NEAREST, FARTHEST = 0.5, 10.0
-"""Depths of random points, as multiples of the scene centre's depth."""
+FARTHEST = 10.0
+"""Greatest depth of random points, as a multiple of the scene centre's depth."""
+NEAREST_UNKNOWN = 0.5
+"""Least one, in the same, where the inputs do not tell (`nearest_expected`)."""
 
 
 @dataclass(frozen=True)
@@ -50,16 +53,19 @@ def joined(parts: Sequence[Points]) -> Points:
 def random_points(cameras: Sequence[Camera], count: int, generator: torch.Generator) -> Points:
     """Points that at least one input camera sees, in random colors.
 
-    Even over the cameras, their pixels, and the logarithm of depth, from 0.5 to 10 times that of
-    the scene's centre, which the frame puts at the origin: surroundings have no far end.
+    Even over the cameras, their pixels, and the logarithm of depth, from the nearest that can be
+    expected to 10 times that of the scene's centre, which the frame puts at the origin:
+    surroundings have no far end.
     """
+    expected = nearest_expected(cameras)
     which = torch.randint(len(cameras), (count,), generator=generator)
     place = torch.rand(count, 3, generator=generator)
     positions = torch.empty(count, 3)
     for index, camera in enumerate(cameras):
         mine = which == index
         reach = max(float(camera.world_to_cam[2, 3]), 0.1)
-        depth = reach * NEAREST * (FARTHEST / NEAREST) ** place[mine, 2]
+        nearest = float(expected[index]) or NEAREST_UNKNOWN * reach
+        depth = nearest * (FARTHEST * reach / nearest) ** place[mine, 2]
         pixels = place[mine, :2] * torch.tensor([camera.width, camera.height])
         homogeneous = torch.cat([pixels, torch.ones(len(pixels), 1)], 1)
         rays = homogeneous @ torch.linalg.inv(camera.intrinsics).T

@@ -15,6 +15,7 @@ from benchmarks.methods.gaussians.options import GaussianOptions
 from benchmarks.methods.gaussians.ply import read_splats, write_splats
 from benchmarks.methods.gaussians.recipe import Recipe
 from benchmarks.methods.gaussians.scene import training_scene
+from benchmarks.methods.gaussians.schedule import exponential
 from benchmarks.methods.gaussians.trainer import Diverged, fit
 from benchmarks.methods.instantsplat import InstantSplat
 from benchmarks.methods.threedgs import ThreeDgs
@@ -151,11 +152,15 @@ def test_growth_adds_gaussians_where_it_may() -> None:
     assert eager.synthesize(inputs).counts["gaussians"] > 250
 
 
-@pytest.mark.parametrize(("below", "said"), [(0.0, "in 0 iterations"), (9.0, "in 10 iterations")])
-def test_dngaussian_waits_with_soft_depth_until_hard_depth_is_near(below: float, said: str) -> None:
+def test_dngaussian_takes_soft_steps_from_a_sixth_of_the_training_on() -> None:
     inputs, _ = scene_inputs(size=16)
-    method = replace(METHODS["dngaussian"], iterations=12, soft_below=below)
-    assert method.fitted(inputs).record["soft depth"] == said  # from a sixth of the training on
+    method = replace(METHODS["dngaussian"], iterations=12)
+    assert method.fitted(inputs).record["soft depth"] == "in 10 iterations"
+
+
+def test_instantsplat_stops_where_a_published_schedule_stands_after_its_iterations() -> None:
+    published = exponential(1.6e-4, 1.6e-6, progress=1000 / 30_000)
+    assert InstantSplat().means_rate_final == pytest.approx(published, rel=1e-3)
 
 
 def test_given_points_are_where_training_starts() -> None:
