@@ -27,6 +27,7 @@ _NOT_PART_OF_THE_RUN = (
     "trainer.gradient_checkpointing",
     "trainer.compile",
     "complete",
+    "average_width",
     *(field.name for field in fields(SceneOptions)),
 )
 """May differ on resume: where things lie, how they are measured, how long is trained, how the
@@ -53,6 +54,11 @@ class RunFolder:
     def samples(self) -> Path:
         """Picture sheets, one a validation."""
         return self.path / "samples"
+
+    @property
+    def averages(self) -> Path:
+        """Snapshots of the weights' averages, named by their step."""
+        return self.path / "averages"
 
     @property
     def model(self) -> Path:
@@ -91,14 +97,26 @@ def open_run(config: TrainConfig) -> RunFolder:
     name = config.run or f"seed{config.seed}-{digest}"
     if name == _LATEST or Path(name).name != name:
         raise InputError(f"run={name}: must be the name of a folder, other than {_LATEST}")
-    path = Path(config.output) / "train" / config.category.name / config.model.name / name
+    path = _runs_of(config) / name
     saved = path / "config.yaml"
     if saved.is_file() and config.resume:
-        _check_same(saved, identity)
+        _check_same(saved, identity, config)
     if not config.resume:
         _start_over(path)
     write_whole(saved, yaml.safe_dump(asdict(config), sort_keys=False).encode())
     return RunFolder(path)
+
+
+def existing_run(config: TrainConfig) -> RunFolder:
+    """The finished run that `run` names, by default the newest; InputError where there is none."""
+    folder = RunFolder(_runs_of(config) / (config.run or _LATEST))
+    if not folder.summary.is_file():
+        raise InputError(f"{folder.path}: holds no finished run; train one (task=category)")
+    return folder
+
+
+def _runs_of(config: TrainConfig) -> Path:
+    return Path(config.output) / "train" / config.category.name / config.model.name
 
 
 def _start_over(path: Path) -> None:
@@ -106,10 +124,12 @@ def _start_over(path: Path) -> None:
     folder = RunFolder(path)
     folder.summary.unlink(missing_ok=True)
     shutil.rmtree(folder.checkpoints, ignore_errors=True)
+    shutil.rmtree(folder.averages, ignore_errors=True)
     (path / "metrics.csv").unlink(missing_ok=True)
 
 
-def _check_same(saved: Path, identity: dict[str, Any]) -> None:
+def _check_same(saved: Path, identity: dict[str, Any], config: TrainConfig) -> None:
+    """Options that the run's version did not have yet had their default."""
     try:
         before = dotted(yaml.safe_load(saved.read_text()))
     except (yaml.YAMLError, AttributeError) as error:
@@ -117,15 +137,23 @@ def _check_same(saved: Path, identity: dict[str, Any]) -> None:
             f"{saved}: unreadable ({error}); remove the run or choose run=NAME"
         ) from None
     changed = [
-        f"{key} (was {before.get(key)}, now {value})"
+        f"{key} (was {was}, now {value})"
         for key, value in identity.items()
-        if before.get(key) != value
+        if (was := before.get(key, _default(config, key))) != value
     ]
     if changed:
         raise InputError(
             f"{saved.parent}: started with other options: {', '.join(changed)}; "
             "give them back their values, or choose another run=NAME, or resume=false to start over"
         )
+
+
+def _default(config: Any, key: str) -> Any:
+    """What the dataclass that holds the option starts it with."""
+    *parents, name = key.split(".")
+    for parent in parents:
+        config = getattr(config, parent)
+    return next(field.default for field in fields(config) if field.name == name)
 
 
 def point_latest(folder: RunFolder) -> None:

@@ -13,6 +13,10 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+import torch
+from safetensors.torch import load_file
+
+from extrap_train.diffusion.checkpoint import load_model
 
 _TINY = [
     "category=hydrant",
@@ -33,6 +37,7 @@ _TINY = [
     "trainer.checkpoint_every=3",
     "trainer.validate_every=6",
     "trainer.batch_size=2",
+    "trainer.power_averages=true",
     "validation.examples=4",
     "validation.pictures=2",
     "sampler.steps=2",
@@ -69,8 +74,10 @@ def _run_folder(output: Path) -> Path:
 
 
 def _weights(output: Path) -> dict[str, bytes]:
-    model = _run_folder(output) / "model"
-    return {str(p.relative_to(model)): p.read_bytes() for p in model.rglob("*.safetensors")}
+    """The model's, and the snapshots of its averages."""
+    run = _run_folder(output)
+    files = [p for part in ("model", "averages") for p in (run / part).rglob("*.safetensors")]
+    return {str(p.relative_to(run)): p.read_bytes() for p in files}
 
 
 def test_the_contract_of_files_is_kept(undisturbed: Path) -> None:
@@ -98,6 +105,25 @@ def test_a_second_run_says_that_it_is_done(undisturbed: Path) -> None:
     text = _finish(undisturbed)
     assert "already trained for 12 steps" in text
     assert _weights(undisturbed) == before
+
+
+def test_an_average_of_another_length_is_a_model_with_its_own_scores(
+    undisturbed: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(undisturbed, tmp_path / "copy", symlinks=True)
+    run = _run_folder(tmp_path / "copy")
+    _finish(tmp_path / "copy", "task=average", "average_width=0.1")
+    made = run / "averages" / "width-0.1"
+    assert json.loads((made / "summary.json").read_text())["steps"] == 12
+    kept = load_file(run / "averages" / "step-00000012.safetensors")
+    weights = dict(load_model(made / "model").named_parameters())
+    assert len(kept) == 2 * len(weights)
+    for name, parameter in weights.items():
+        assert torch.allclose(parameter, kept[f"0.1/{name}"].float(), atol=1e-4)
+    shutil.rmtree(run / "averages")
+    process = _start(tmp_path / "copy", "task=average")
+    assert process.wait(timeout=300) == 1
+    assert "train with trainer.power_averages=true" in _said(tmp_path / "copy")
 
 
 def test_killed_at_any_moment_the_weights_are_the_same(undisturbed: Path, tmp_path: Path) -> None:

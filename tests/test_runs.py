@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import yaml
 
 from extrap_train.config import (
     CategoryConfig,
@@ -62,6 +63,18 @@ def test_resuming_a_named_run_with_other_options_says_which(config: TrainConfig)
     with pytest.raises(InputError, match=r"model\.learning_rate \(was 0\.0003, now 0\.5\)"):
         open_run(changed)
     open_run(replace(changed, resume=False))
+
+
+def test_an_option_that_is_new_since_had_its_default(config: TrainConfig) -> None:
+    saved = open_run(replace(config, run="mine")).path / "config.yaml"
+    options = yaml.safe_load(saved.read_text())
+    del options["trainer"]["power_averages"]
+    saved.write_text(yaml.safe_dump(options))
+    open_run(replace(config, run="mine"))
+    saved.write_text(yaml.safe_dump(options))
+    changed = replace(config.trainer, power_averages=True)
+    with pytest.raises(InputError, match=r"power_averages \(was False, now True\)"):
+        open_run(replace(config, run="mine", trainer=changed))
 
 
 def test_starting_over_forgets_the_finished_run(config: TrainConfig) -> None:

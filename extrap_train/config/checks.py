@@ -98,6 +98,7 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "trainer.condition_dropout": (0, 1),
     "trainer.min_snr": (0.01, 1e6),
     "trainer.ema_decay": (0, 0.999999),
+    "average_width": (0.01, 0.28),
     "trainer.devices": (1, math.inf),
     "trainer.checkpoint_every": (1, math.inf),
     "trainer.validate_every": (1, math.inf),

@@ -25,6 +25,8 @@ class TrainerConfig:
     """
     ema_decay: float = 0.999
     """Of the averaged weights; 0 keeps no average, which saves their memory."""
+    power_averages: bool = False
+    """Keep snapshots from which `task=average` makes averaged weights of any length afterwards."""
     precision: str = "bf16-mixed"
     """Lightning's name of it: `bf16-mixed`, `32-true`, `16-mixed` …"""
     gradient_checkpointing: bool = False

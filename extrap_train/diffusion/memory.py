@@ -14,6 +14,7 @@ from torch.utils._pytree import tree_leaves
 from torch.utils.weak import WeakIdKeyDictionary
 
 from extrap_train.config import ModelConfig, TrainerConfig
+from extrap_train.diffusion.averages import TRACKED_WIDTHS
 from extrap_train.diffusion.denoiser import build_unet
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError
@@ -98,7 +99,7 @@ def training_memory(model: ExtrapolationModel, options: TrainerConfig) -> Traini
     return TrainingMemory(
         weights=everything,
         optimizer=_ADAM_MOMENTS * trained,
-        average=trained if options.ema_decay else 0,
+        average=trained * ((options.ema_decay > 0) + options.power_averages * len(TRACKED_WIDTHS)),
         step=_step_bytes(model.config, model.unet.config["in_channels"], options)
         if everything > GIB // 8
         else trained,

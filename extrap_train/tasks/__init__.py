@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 TASKS = (
+    "average",
     "category",
     "complete",
     "pack",

@@ -1,7 +1,6 @@
 """`task=category`, the main job: data, training and validation of a category model."""
 
 import logging
-import os
 import time
 import warnings
 from pathlib import Path
@@ -14,9 +13,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from rich.console import Console
 
 from extrap_train.config import TrainConfig
-from extrap_train.data.examples import ExampleReader
-from extrap_train.data.module import PairModule
-from extrap_train.data.store import PreparedData
+from extrap_train.diffusion.averages import PowerAverages
 from extrap_train.diffusion.callbacks import (
     AveragedWeights,
     EpochCheckpoints,
@@ -32,14 +29,14 @@ from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.errors import InputError
 from extrap_train.metrics import Distance, lpips_or_reason
 from extrap_train.runs import RunFolder, open_run, point_latest, provenance
-from extrap_train.tasks.prepare import prepare_category
-from extrap_train.tasks.results import Results, draw_views, is_finished, write_results
+from extrap_train.tasks.results import Results, draw_curve, draw_views, is_finished, write_results
+from extrap_train.tasks.training_data import data_module, prepared_data, validation_names
 
 
 def run(config: TrainConfig) -> Path:
     """Train a category model and leave weights, metrics, pictures and `summary.json` behind."""
     console = Console()
-    _quieten_lightning()
+    quieten_lightning()
     distance, missing = lpips_or_reason(config.validation.lpips_weights)
     model = _model(config)
     if (needed := training_memory(model, config.trainer)).is_worth_a_word:
@@ -68,11 +65,11 @@ def _train(
     console: Console,
 ) -> None:
     started = time.perf_counter()
-    prepared = _prepared(config)
+    prepared = prepared_data(config)
     point_latest(folder)
     seconds = {"prepare": time.perf_counter() - started}
-    data = _data_module(config, prepared)
-    training = CategoryTraining(model, config, _names(data), distance)
+    data = data_module(config, prepared)
+    training = CategoryTraining(model, config, validation_names(data), distance)
     started = time.perf_counter()
     trainer = _trainer(config, folder)
     with advice_where_memory_ends(config.trainer):
@@ -93,25 +90,11 @@ def _train(
         parameters=sum(p.numel() for p in training.model.parameters()),
         provenance=provenance(config, {d.folder.name: d.manifest["key"] for d in prepared}),
     )
+    draw_curve(folder)
     write_results(results, config, folder, console)
 
 
-def _prepared(config: TrainConfig) -> list[PreparedData]:
-    return [
-        prepare_category(
-            member,
-            config.data,
-            config.depth,
-            config.prep,
-            output=Path(config.output),
-            workers=config.threads or len(os.sched_getaffinity(0)),
-            matcher=config.matcher,
-        )
-        for member in config.category.members
-    ]
-
-
-def _quieten_lightning() -> None:
+def quieten_lightning() -> None:
     """Its tips and device lists say nothing about the user's run."""
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", module="lightning")
@@ -128,36 +111,6 @@ def _model(config: TrainConfig) -> ExtrapolationModel:
     if config.trainer.compile:
         model.unet.compile()
     return model
-
-
-def _data_module(config: TrainConfig, prepared: list[PreparedData]) -> PairModule:
-    train, validation = (
-        ExampleReader(prepared, split, config.model.references) for split in ("train", "test")
-    )
-    for split, reader in (("training", train), ("test", validation)):
-        if not len(reader):
-            raise InputError(
-                f"no {split} pairs for {config.category.name}: see the preparation's report, "
-                "and loosen the options under prep"
-            )
-    return PairModule(
-        train,
-        validation,
-        image_size=config.model.image_size,
-        batch_size=config.trainer.batch_size,
-        batches_per_epoch=min(config.trainer.checkpoint_every, config.trainer.steps),
-        validation_examples=config.validation.examples,
-        validation_batch_size=config.validation.batch_size,
-        references=config.model.references,
-        workers=config.trainer.workers,
-        seed=config.seed,
-    )
-
-
-def _names(data: PairModule) -> list[list[str]]:
-    names = [data.validation.name(index) for index in data.chosen]
-    size = data.validation_batch_size
-    return [names[i : i + size] for i in range(0, len(names), size)]
 
 
 def _newest(folder: RunFolder) -> str | None:
@@ -204,6 +157,7 @@ def _trainer(config: TrainConfig, folder: RunFolder) -> lightning.Trainer:
         plugins=[WholeCheckpointIO()],
         callbacks=[
             *([AveragedWeights(options.ema_decay)] if options.ema_decay else []),
+            *([PowerAverages(folder.averages)] if options.power_averages else []),
             StepProgress(options.steps),
             _Pictures(folder.samples),
             EpochCheckpoints(folder.checkpoints),

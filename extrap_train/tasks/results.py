@@ -55,7 +55,6 @@ def write_results(
     results.scores.to_csv(text, index=False)
     write_whole(folder.path / "validation.csv", text.getvalue().encode())
     draw_views(results.shown, folder.samples / "final.png")
-    draw_curve(folder)
     summary = {
         "validation": validation,
         "missing": results.missing,

@@ -1,0 +1,59 @@
+"""The pairs that a category is trained on and measured on."""
+
+import os
+from pathlib import Path
+
+from extrap_train.config import TrainConfig
+from extrap_train.data.examples import ExampleReader
+from extrap_train.data.module import PairModule
+from extrap_train.data.store import PreparedData
+from extrap_train.errors import InputError
+from extrap_train.tasks.prepare import prepare_category
+
+
+def prepared_data(config: TrainConfig) -> list[PreparedData]:
+    """Every member category, prepared now or before."""
+    return [
+        prepare_category(
+            member,
+            config.data,
+            config.depth,
+            config.prep,
+            output=Path(config.output),
+            workers=config.threads or len(os.sched_getaffinity(0)),
+            matcher=config.matcher,
+        )
+        for member in config.category.members
+    ]
+
+
+def data_module(config: TrainConfig, prepared: list[PreparedData]) -> PairModule:
+    """Training and held-out pairs; InputError where there are none of either."""
+    train, validation = (
+        ExampleReader(prepared, split, config.model.references) for split in ("train", "test")
+    )
+    for split, reader in (("training", train), ("test", validation)):
+        if not len(reader):
+            raise InputError(
+                f"no {split} pairs for {config.category.name}: see the preparation's report, "
+                "and loosen the options under prep"
+            )
+    return PairModule(
+        train,
+        validation,
+        image_size=config.model.image_size,
+        batch_size=config.trainer.batch_size,
+        batches_per_epoch=min(config.trainer.checkpoint_every, config.trainer.steps),
+        validation_examples=config.validation.examples,
+        validation_batch_size=config.validation.batch_size,
+        references=config.model.references,
+        workers=config.trainer.workers,
+        seed=config.seed,
+    )
+
+
+def validation_names(data: PairModule) -> list[list[str]]:
+    """What the held-out views of each validation batch are called."""
+    names = [data.validation.name(index) for index in data.chosen]
+    size = data.validation_batch_size
+    return [names[i : i + size] for i in range(0, len(names), size)]
