@@ -1,6 +1,7 @@
 """The growing cloud in a browser (viser, the extra `viewer`)."""
 
 import math
+import threading
 from types import TracebackType
 from typing import Any
 
@@ -37,6 +38,7 @@ class CloudViewer:
                 'viewer=true needs viser: pip install "extrap-train[viewer]"'
             ) from None
         self._votes = votes
+        self._page = threading.RLock()  # sliders call from the server's threads
         self._cloud: PointCloud | None = None
         self._known: GlobalMap | None = None
         self._frusta: dict[int, Any] = {}
@@ -45,8 +47,8 @@ class CloudViewer:
         self._step = gui.add_slider("views", min=1, max=2, step=1, initial_value=1)
         self._least = gui.add_slider("least confidence", 0.0, 1.0, 0.05, 0.1)
         self._count = gui.add_text("points", "0", disabled=True)
-        self._step.on_update(lambda _: self._draw())
-        self._least.on_update(lambda _: self._draw())
+        self._step.on_update(self._moved)
+        self._least.on_update(self._moved)
 
     @property
     def port(self) -> int:
@@ -60,22 +62,24 @@ class CloudViewer:
 
     def select(self, views: int, least_confidence: float) -> None:
         """What the sliders do."""
-        self._step.value, self._least.value = views, least_confidence
-        self._draw()
+        with self._page:
+            self._step.value, self._least.value = views, least_confidence
+            self._draw()
 
     def show(self, known: GlobalMap) -> None:
         """Put a map on the page."""
-        following = self._known is None or self._step.value == len(self._known)
-        if self._known is None:
-            self._face(known)
-        self._known = known
-        self._cloud = cloud_of(known, votes=self._votes)
-        self._step.max = max(2, len(known))
-        for index, view in enumerate(known.views):
-            self._add_frustum(index, view)
-        if following:
-            self._step.value = len(known)
-        self._draw()
+        cloud = cloud_of(known, votes=self._votes)
+        with self._page:
+            following = self._known is None or self._step.value == len(self._known)
+            if self._known is None:
+                self._face(known)
+            for index, view in enumerate(known.views):
+                self._add_frustum(index, view)
+            self._known, self._cloud = known, cloud
+            self._step.max = max(2, len(known))
+            if following:
+                self._step.value = len(known)
+            self._draw()
 
     def close(self) -> None:
         """Take the page down."""
@@ -102,6 +106,12 @@ class CloudViewer:
         camera.up = up
         camera.look_at = np.zeros(3)  # the map's world has the scene at its origin
         camera.position = FIRST_DISTANCE * cam_to_world[0, :3, 3].numpy()
+
+    def _moved(self, event: Any) -> None:
+        """A visitor moved a slider; where we did, `client_id` is None and we draw ourselves."""
+        if event.client_id is not None:
+            with self._page:
+                self._draw()
 
     def _draw(self) -> None:
         if self._cloud is None or self._known is None:

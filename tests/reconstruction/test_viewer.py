@@ -1,6 +1,7 @@
 """The growing cloud in a real browser: it connects, draws, and its sliders choose what is shown."""
 
 import shutil
+import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -10,7 +11,13 @@ import scenes
 import torch
 from PIL import Image
 
-from extrap_train.reconstruction.global_map import GENERATED, GIVEN, GlobalMap, Origin
+from extrap_train.reconstruction.global_map import (
+    GENERATED,
+    GIVEN,
+    GlobalMap,
+    MapView,
+    Origin,
+)
 from extrap_train.reconstruction.viewer import CloudViewer
 from extrap_train.views import View
 
@@ -64,6 +71,46 @@ def test_more_views_are_more_points_and_the_sliders_take_them_away(viewer: Cloud
     assert viewer.shown_points == first
     viewer.select(views=4, least_confidence=1.0)
     assert viewer.shown_points <= len(_grown(4)) * _SIZE**2
+
+
+def test_a_slider_that_moves_while_a_view_comes_waits_for_all_of_it(
+    viewer: CloudViewer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The server calls from threads of its own, in the middle of `show`."""
+    viewer.show(_grown(1))
+    add, failures, visitors = viewer._add_frustum, [], []
+
+    def visit() -> None:
+        try:
+            viewer.select(views=2, least_confidence=0.5)
+        except Exception as error:
+            failures.append(error)
+
+    def add_while_visited(index: int, view: MapView) -> None:
+        visitors.append(threading.Thread(target=visit))
+        visitors[-1].start()
+        visitors[-1].join(timeout=0.1)
+        add(index, view)
+
+    monkeypatch.setattr(viewer, "_add_frustum", add_while_visited)
+    viewer.show(_grown(3))
+    for visitor in visitors:
+        visitor.join()
+    assert not failures
+    at_once = viewer.shown_points
+    viewer.select(views=2, least_confidence=0.5)
+    assert viewer.shown_points == at_once
+
+
+def test_a_view_that_comes_is_drawn_once(
+    viewer: CloudViewer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = []
+    draw = viewer._draw
+    monkeypatch.setattr(viewer, "_draw", lambda: drawn.append(draw()))
+    viewer.show(_grown(1))
+    viewer.show(_grown(3))
+    assert len(drawn) == 2
 
 
 @pytest.mark.slow
