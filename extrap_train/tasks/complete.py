@@ -125,10 +125,10 @@ def _run(job: _Job, console: Console) -> None:
     started = time.perf_counter()
     with _viewer(job, known, console) as viewer:
         known = _completed(job, known, queries, workshop, viewer)
-    seconds["views"] = time.perf_counter() - started
-    steps = load_steps(job.folder / "map", len(known))
-    done = Completed(known, steps, job.unit, job.truth, seconds)
-    write_completed(done, job.config, job.sequence, workshop, job.folder, console)
+        seconds["views"] = time.perf_counter() - started
+        steps = load_steps(job.folder / "map", len(known))
+        done = Completed(known, steps, job.unit, job.truth, seconds)
+        write_completed(done, job.config, job.sequence, workshop, job.folder, console)
 
 
 def _workshop(job: _Job) -> Workshop:
@@ -230,7 +230,7 @@ def _plan_text(known: GlobalMap, order: list[Query]) -> str:
 
 @contextmanager
 def _viewer(job: _Job, known: GlobalMap, console: Console) -> Iterator[CloudViewer | None]:
-    """The page, where it is wanted; it stays until its visitor ends it."""
+    """The page, where it is wanted; once all is done it stays until its visitor ends it."""
     options = job.config.complete
     if not options.viewer:
         yield None
@@ -240,7 +240,7 @@ def _viewer(job: _Job, known: GlobalMap, console: Console) -> Iterator[CloudView
         console.print(f"viewer: http://localhost:{viewer.port}")
         yield viewer
         if sys.stdin.isatty():
-            input("the scene is complete; Enter closes the viewer and writes the results ")
+            input("the scene is complete and written; Enter closes the viewer ")
 
 
 def _completed(
