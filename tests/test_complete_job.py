@@ -88,6 +88,8 @@ def test_the_contract_of_files_is_kept(undisturbed: Path) -> None:
     steps = summary["steps"]
     assert len(steps) == summary["views"]["generated"] > 2
     assert all({"plan", "generate", "align", "merge"} <= step["seconds"].keys() for step in steps)
+    assert {"inputs", "views", "export", "splats", "measure"} == summary["seconds"].keys()
+    assert summary["seconds"]["splats"] >= summary["splats"]["seconds"] > 0
     before, after = summary["metrics"]["inputs"], summary["metrics"]["completed"]
     assert after["completeness"] > before["completeness"] + 0.1
     assert after["accuracy"] > 0.9

@@ -75,7 +75,9 @@ def write_completed(
     draw_turntable(done.known, cloud, folder / "turntable.mp4")
     _draw_views(done.known, folder / "views.png")
     done.seconds["export"] = time.perf_counter() - started
+    started = time.perf_counter()
     splats, no_splats = _splats(done, config, folder)
+    done.seconds["splats"] = time.perf_counter() - started
     started = time.perf_counter()
     held_out, missing = _compare_held_out(done, config, sequence, workshop, folder)
     metrics = _metrics(done, cloud)
