@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -22,27 +23,55 @@ from extrap_train.views import Camera, stack_cameras
 PICTURE_SIZE = 192
 TURN_FRAMES = 48
 STAGES = 5
+FRAMED = 0.99
+"""Share of the cloud that fits into a picture of it whole: strays would make all else tiny."""
 REACH = 0.6
-"""Points farther from the scene's centre than this share of the cameras' distance are not drawn:
-they would hide the object.
+"""Close pictures leave out points farther from the scene's centre than this share of the cameras'
+distance: they would hide the object.
 """
 
 
 def draw_growth(known: GlobalMap, cloud: PointCloud, path: Path) -> None:
-    """A strip of the cloud after the inputs and after more and more views, from both sides."""
+    """A strip of the cloud after the inputs and after more and more views, from both sides: close,
+    and from where the whole cloud at the end fits into the picture.
+    """
     given = sum(view.origin.kind == GIVEN for view in known.views)
     stages = sorted({round(n) for n in np.linspace(given, len(known), STAGES)})
-    cameras = _turn(known, 2)
+    close = _turn(known, 2)
+    far = framed(close, cloud)
     columns = {}
     for count in stages:
         title = f"{given} inputs" if count == given else f"+ {count - given} views"
-        columns[title] = _drawn(cloud[cloud.view < count], cameras)
+        then = cloud[cloud.view < count]
+        columns[title] = torch.cat([_drawn(_near(then, close), close), _drawn(then, far)])
     contact_sheet(columns, path)
 
 
 def draw_turntable(known: GlobalMap, cloud: PointCloud, path: Path) -> None:
     """A film around the whole cloud."""
-    film(_drawn(cloud, _turn(known, TURN_FRAMES)), path)
+    cameras = _turn(known, TURN_FRAMES)
+    film(_drawn(_near(cloud, cameras), cameras), path)
+
+
+def framed(cameras: Camera, cloud: PointCloud) -> Camera:
+    """The cameras, all at one distance from what they look at, which the cloud fits into.
+
+    A point at (x, y, z) from the scene's centre, in a camera's axes, is in its picture from the
+    distance max(|x| fx / cx, |y| fy / cy) - z on; the middle of the picture must be its centre.
+    """
+    if not len(cloud):
+        return cameras
+    center = torch.from_numpy(scene_center(cameras)).to(cloud.points)
+    needed = []
+    for camera in (cameras[i] for i in range(len(cameras.world_to_cam))):
+        x, y, z = ((cloud.points - center) @ camera.world_to_cam[:3, :3].mT).unbind(-1)
+        k = camera.intrinsics
+        aside = torch.maximum(x.abs() * k[0, 0] / k[0, 2], y.abs() * k[1, 1] / k[1, 2])
+        needed.append((aside - z).quantile(FRAMED))
+    moved = cameras.world_to_cam.clone()
+    moved[:, :3, 3] = -(moved[:, :3, :3] @ center)
+    moved[:, 2, 3] += torch.stack(needed).max()
+    return replace(cameras, world_to_cam=moved)
 
 
 def draw_plan(known: GlobalMap, queries: Sequence[Query], path: Path) -> None:
@@ -80,13 +109,16 @@ def _turn(known: GlobalMap, count: int) -> Camera:
     return circle_cameras(given, middle, count).resized(PICTURE_SIZE, PICTURE_SIZE)
 
 
-def _drawn(cloud: PointCloud, cameras: Camera) -> Float[Tensor, "n 3 h w"]:
-    """The cloud as each camera sees it, on white."""
+def _near(cloud: PointCloud, cameras: Camera) -> PointCloud:
     center = torch.from_numpy(scene_center(cameras)).to(cloud.points)
     distance = (cameras.center - center).norm(dim=-1).mean()
-    near = cloud[(cloud.points - center).norm(dim=-1) < REACH * distance]
+    return cloud[(cloud.points - center).norm(dim=-1) < REACH * distance]
+
+
+def _drawn(cloud: PointCloud, cameras: Camera) -> Float[Tensor, "n 3 h w"]:
+    """The cloud as each camera sees it, on white."""
     pictures = []
     for index in range(len(cameras.world_to_cam)):
-        drawn = splat(near.points, near.colors, cameras[index])
+        drawn = splat(cloud.points, cloud.colors, cameras[index])
         pictures.append(torch.where(drawn.weight > 0, drawn.values, 1.0))
     return torch.stack(pictures)
