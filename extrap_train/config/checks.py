@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from extrap_train.config.commands import DataPrepConfig, TrainConfig
-from extrap_train.config.completion import CompletionConfig
 from extrap_train.config.data import Co3dConfig, PrepConfig
 from extrap_train.config.model import FAMILIES, ModelConfig, SamplerConfig
 from extrap_train.config.training import TrainerConfig
@@ -125,7 +124,7 @@ def validate(config: TrainConfig | DataPrepConfig, tasks: tuple[str, ...]) -> No
         _check_one_of("trainer.accelerator", config.trainer.accelerator, _ACCELERATORS)
         _check_intervals(config.trainer)
         _check_model(config.model, config.prep)
-        _check_completion(config.complete)
+        _check_completion(config)
         _check_sampler(config.sampler)
 
 
@@ -227,7 +226,13 @@ def _check_sampler(sampler: SamplerConfig) -> None:
         )
 
 
-def _check_completion(complete: CompletionConfig) -> None:
+def _check_completion(config: TrainConfig) -> None:
+    complete = config.complete
+    named = len(config.input_frames)
+    if config.task == "complete" and (named or config.inputs) == 1:
+        raise InputError(
+            "one photograph does not show where its surfaces are; give at least two (inputs=3)"
+        )
     _check_one_of("complete.draw", complete.draw, ("one_sided", "spread"))
     _check_one_of("complete.poses", complete.poses, ("orbit", "capture"))
     _check_one_of("complete.generator", complete.generator, ("model", "exact"))

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
@@ -140,6 +140,14 @@ def check_cameras(cameras: Sequence[Camera], names: Sequence[str]) -> None:
             f"{names[one]} and {names[other]} stand in the same place as seen from the scene; "
             "leave one out or correct the poses"
         )
+
+
+def stand_where(
+    camera: Camera, others: Camera, center: Float[np.ndarray, "3"]
+) -> Bool[np.ndarray, " n"]:
+    """Which of the others stand where an (unbatched) camera does, as seen from the scene."""
+    poses = [camera, *(others[i] for i in range(len(others.world_to_cam)))]
+    return pairwise_angles(stack_poses(poses), center)[0, 1:] < SAME_POSE_RAD
 
 
 def _check_lens(camera: Camera, name: str) -> None:

@@ -24,6 +24,7 @@ from extrap_train.config import (
     dotted,
 )
 from extrap_train.data.files import write_whole
+from extrap_train.data.photographs import CATEGORY
 from extrap_train.data.scene import SYNTHETIC_SCHEME, open_scene
 from extrap_train.data.sequences import Sequence
 from extrap_train.data.synthetic import SyntheticScene, build_scene
@@ -39,6 +40,7 @@ from extrap_train.reconstruction.inputs import (
     check_cameras,
     choose_frames,
     first_views,
+    stand_where,
     world_unit,
 )
 from extrap_train.reconstruction.map_files import load_map, load_steps, save_step, save_view
@@ -102,8 +104,22 @@ def _job(config: TrainConfig) -> _Job:
     )
     cameras = [sequence.frames[i].camera for i in inputs]
     check_cameras(cameras, [sequence.frames[i].name for i in inputs])
+    _check_category(config, sequence)
     folder = Path(config.output) / "complete" / (config.run or _slug(sequence))
     return _Job(config, sequence, truth, folder, inputs, world_unit(stack_poses(cameras)))
+
+
+def _check_category(config: TrainConfig, sequence: Sequence) -> None:
+    """A category's newest model is not to paint another category unasked."""
+    own, chosen = sequence.category, config.category.name
+    if own in (CATEGORY, chosen):
+        return
+    if config.weights is None and config.complete.generator == "model":
+        raise InputError(
+            f"scene {config.scene!r} is of category {own}, but category={chosen} would paint it "
+            f"with its newest model: give category={own}, or name the model, weights=FOLDER or base"
+        )
+    Console().print(f"the scene is of category {own}, not {chosen}")
 
 
 def _slug(sequence: Sequence) -> str:
@@ -212,11 +228,9 @@ def _queries(job: _Job, known: GlobalMap) -> list[Query]:
     if job.config.complete.poses == "orbit":
         return orbit_queries(given, np.radians(job.config.complete.step_deg))
     size = known.views[0].camera.width
-    return [
-        Query(frame.name, job.unit.inside(frame.camera.squared(size)))
-        for index, frame in enumerate(job.sequence.frames)
-        if index not in job.inputs
-    ]
+    others = [frame for i, frame in enumerate(job.sequence.frames) if i not in job.inputs]
+    queries = [Query(frame.name, job.unit.inside(frame.camera.squared(size))) for frame in others]
+    return [q for q in queries if not stand_where(q.camera, given, np.zeros(3)).any()]
 
 
 def _plan_text(known: GlobalMap, order: list[Query]) -> str:

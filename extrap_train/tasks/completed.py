@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from rich.console import Console
 from rich.table import Table
@@ -14,7 +15,7 @@ from rich.table import Table
 from benchmarks.methods.gaussians.trainer import Diverged
 from extrap_train.config import TrainConfig
 from extrap_train.data.files import write_whole
-from extrap_train.data.sequences import Sequence
+from extrap_train.data.sequences import Frame, Sequence
 from extrap_train.data.synthetic import SyntheticScene
 from extrap_train.errors import InputError
 from extrap_train.metrics import psnr, quantised, squeeze_lpips, ssim
@@ -22,9 +23,9 @@ from extrap_train.pictures import colour_depth, contact_sheet, error_map, mark_h
 from extrap_train.reconstruction.cloud import PointCloud, cloud_of
 from extrap_train.reconstruction.completion import REFERENCES, Step, Workshop
 from extrap_train.reconstruction.export import write_cloud, write_colmap, write_views
-from extrap_train.reconstruction.global_map import GENERATED, GIVEN, GlobalMap
+from extrap_train.reconstruction.global_map import GENERATED, GIVEN, GlobalMap, MapView
 from extrap_train.reconstruction.growth import draw_growth, draw_turntable
-from extrap_train.reconstruction.inputs import WorldUnit
+from extrap_train.reconstruction.inputs import WorldUnit, stand_where
 from extrap_train.reconstruction.prior import prior_of
 from extrap_train.reconstruction.report import (
     cloud_scores,
@@ -35,7 +36,7 @@ from extrap_train.reconstruction.report import (
 )
 from extrap_train.runs import provenance
 from extrap_train.tasks.splats import write_fitted_splats
-from extrap_train.views import stack_cameras
+from extrap_train.views import Camera, stack_cameras
 
 SUBDIVIDE = 3
 """Points that a pixel of the cloud becomes along each axis."""
@@ -155,9 +156,7 @@ def _compare_held_out(
 ) -> tuple[dict[str, float | None] | None, dict[str, str]]:
     """Views generated at the poses of photographs that were no inputs, against these."""
     given = done.known.views[: _count(done.known, GIVEN)]
-    names = {view.view.name for view in given}
-    frames = [frame for frame in sequence.frames if frame.name not in names]
-    frames = frames[: config.complete.held_out]
+    frames = _held_out(given, done.unit, sequence)[: config.complete.held_out]
     if not frames or config.complete.generator == "exact":
         return None, {}
     size = workshop.generator.image_size
@@ -166,7 +165,7 @@ def _compare_held_out(
     made, warps, masks = [], [], []
     only = GlobalMap(done.known.tolerance, given)
     for view, camera in zip(truth, cameras, strict=True):
-        near = [done.known.views[i].view for i in done.known.nearest(camera, REFERENCES)]
+        near = [done.known.views[i].view for i in _elsewhere(done.known, camera)]
         query = stack_cameras([camera])
         generated = workshop.generator.generate(near, query, [view.name], config.seed)
         made.append(generated.images[0])
@@ -200,6 +199,26 @@ def _compare_held_out(
             raise
         return scores, {"lpips": str(error)}
     return scores, {}
+
+
+def _held_out(given: List[MapView], unit: WorldUnit, sequence: Sequence) -> list[Frame]:
+    """The frames that are no inputs and were not taken from where an input was."""
+    names = {view.view.name for view in given}
+    inputs = stack_cameras([unit.outside(view.camera) for view in given])
+    center = unit.center.double().numpy()
+    return [
+        frame
+        for frame in sequence.frames
+        if frame.name not in names and not stand_where(frame.camera, inputs, center).any()
+    ]
+
+
+def _elsewhere(known: GlobalMap, camera: Camera) -> list[int]:
+    """The nearest views that do not stand where the camera does: `complete.poses=capture` has made
+    views there, which would be painted from themselves.
+    """
+    there = stand_where(camera, known.cameras, np.zeros(3))
+    return [i for i in known.nearest(camera, len(known)) if not there[i]][:REFERENCES]
 
 
 def _print(summary: dict[str, Any], console: Console) -> None:

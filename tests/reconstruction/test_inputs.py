@@ -16,6 +16,7 @@ from extrap_train.reconstruction.inputs import (
     check_cameras,
     choose_frames,
     first_views,
+    stand_where,
     world_unit,
 )
 from extrap_train.reconstruction.pose_check import check_poses
@@ -40,6 +41,13 @@ def test_a_single_view_is_refused():
 def test_two_identical_poses_are_refused():
     with pytest.raises(InputError, match="a and c stand in the same place"):
         check_cameras(cameras(0, 30, 0), NAMES)
+
+
+def test_which_cameras_stand_where_another_does():
+    others = stack_cameras(cameras(-30, 0, 0.2, 30))
+    nearer = scenes.orbit_camera(0)
+    center = scene_center(others)
+    assert stand_where(nearer, others, center).tolist() == [False, True, True, False]
 
 
 def test_views_that_see_nothing_in_common_are_refused():

@@ -82,6 +82,28 @@ def test_a_single_view(refused: Command, pictures: list[np.ndarray], tmp_path: P
     assert "at least two" in refused(content, "inputs=1")
 
 
+@pytest.mark.parametrize("one", ["inputs=1", "input_frames=[a.png]"])
+def test_a_single_view_is_refused_before_the_scene_is_read(
+    one: str, refused: Command, tmp_path: Path
+) -> None:
+    (tmp_path / "scene").mkdir()
+    assert "at least two" in refused({"no": "cameras"}, one)
+
+
+def test_a_scene_of_another_category_needs_a_named_model(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["task=complete", "category=cup", "scene=synthetic:hydrant/0000", "inputs=3"]
+    options += [f"output={tmp_path}", "data.image_size=32", "complete.exact_size=32"]
+    monkeypatch.setattr(sys, "argv", ["extrap_train", *options])
+    with pytest.raises(SystemExit, match=r"is of category hydrant.*give category=hydrant"):
+        main()
+    more = ["complete.generator=exact", "complete.dry_run=true"]
+    monkeypatch.setattr(sys, "argv", ["extrap_train", *options, *more])
+    main()
+    assert "the scene is of category hydrant, not cup" in capsys.readouterr().out
+
+
 def test_two_identical_poses(refused: Command, pictures: list[np.ndarray], tmp_path: Path) -> None:
     content = _capture(tmp_path / "scene", pictures)
     content["frames"][1]["transform_matrix"] = content["frames"][0]["transform_matrix"]

@@ -13,6 +13,7 @@ from PIL import Image
 from extrap_train.__main__ import main
 from extrap_train.config import ModelConfig, UNetConfig
 from extrap_train.diffusion.checkpoint import save_model
+from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.tasks.view import open_generator, open_views, walk
 
@@ -130,3 +131,23 @@ def test_what_cannot_be_used_is_one_line(command, weights, tmp_path) -> None:
     empty.write_text('{"frames": []}')
     assert "expected frames in a list" in _refused(command, *view, f"pose={empty}")
     assert "has 8 frames, fewer than the 9" in _refused(command, *view, "orbit=90", "inputs=9")
+
+
+def test_no_held_out_view_is_painted_from_where_it_stands(
+    command, weights, tmp_path, monkeypatch
+) -> None:
+    """Completed at the capture's own poses, the map has a view where each photograph was taken."""
+    asked = []
+    generate = DiffusionGenerator.generate
+
+    def recorded(self, references, queries, names, seed=0):
+        asked.append((names[0], [view.name for view in references]))
+        return generate(self, references, queries, names, seed)
+
+    monkeypatch.setattr(DiffusionGenerator, "generate", recorded)
+    options = ["complete.poses=capture", "complete.splats.fit=false", "sampler.steps=1"]
+    command("task=complete", f"weights={weights}", *options, "complete.confidence.attempts=1")
+    summary = json.loads((tmp_path / "complete" / "hydrant_0000" / "summary.json").read_text())
+    assert summary["held_out"]["views"] == summary["views"]["generated"] == 4
+    assert len(asked) == 8
+    assert not [name for name, references in asked if name in references]
