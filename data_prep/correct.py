@@ -2,8 +2,9 @@
 
 Wrong depths shift the warped image against the true one. A matcher finds where the warp's pixels
 are in the truth, a smooth flow is fitted to what is no outlier, and the warp is drawn again with
-its points moved by it. A correction must prove itself: where neither the picture comes closer to
-the truth nor the matches to where they belong, the warp stays as it is.
+its points moved by it. A correction must prove itself, and not only by what it was fitted to: any
+two pictures come closer if one may be bent. Wrong depths move points along their epipolar lines
+alone, so that matches that leave those lines are chance, and the warp stays as it is.
 """
 
 import math
@@ -14,22 +15,28 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
+from extrap_train.geometry.epipolar import steps_across
 from extrap_train.geometry.flow import fit_flow, flow_at, least_squares_flow
 from extrap_train.geometry.warp import warp_references
 from extrap_train.matching import Matcher
 from extrap_train.views import Camera, Warp, stack_cameras
 
-METHOD = 2
+METHOD = 3
 """Raised whenever the same frames give other corrections, so that old ones are made anew."""
 LEAST_MATCHES = 40
 """Fewer do not tell a smooth motion from chance."""
+LARGEST_ACROSS = 0.006
+"""Median distance of the matches from their points' epipolar lines, as a share of the picture's
+longer side (0.75 px of 128). Wrong depths give none, real poses and matchers half of it, and chance
+as much across the lines as along them: twice of it and more (docs/preparation.md)."""
 LEAST_INLIERS = 0.5
 """Share of the matches that a smooth motion must explain."""
 LEAST_STEP = 0.1
 """Pixels that the matches must move by, in the median: a matcher knows no less, and exact depths
 are not to be moved."""
 LEAST_GAIN = 0.01
-"""Share of the photometric error that a correction must take away; less is chance."""
+"""Share of the photometric error that a correction must take away: less is within what resampling
+does to a warp. Says nothing of chance, which takes away as much."""
 STIFFER = (1e-4, 1e-3)
 """Also tried in place of `flow.STIFFNESS`: noise in the depths shakes a field that bends easily."""
 MOST_MATCHES = 2000
@@ -69,6 +76,10 @@ def correct_pair(
         return Correction(None, error_before, error_before, f"only {len(matches)} matches")
     chosen = torch.linspace(0, len(matches) - 1, min(len(matches), MOST_MATCHES)).long()
     matches = matches[chosen]
+    across = float(steps_across(matches.first, matches.first_to_second, reference, query).median())
+    if across > LARGEST_ACROSS * max(query.width, query.height):
+        reason = f"the matches lie {across:.1f} px off their epipolar lines"
+        return Correction(None, error_before, error_before, reason)
     size = torch.tensor([query.width, query.height])
     positions, steps = matches.first / size * 2 - 1, matches.first_to_second / size * 2
     flow, inliers = fit_flow(positions, steps, matches.confidence, grid)

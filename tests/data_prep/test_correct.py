@@ -1,5 +1,7 @@
 """Warp correction against scenes whose depth is known exactly, with errors put in."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
@@ -132,10 +134,11 @@ class Fixed:
     [
         (0, torch.zeros(0, 2), "only 0 matches"),
         (300, torch.zeros(300, 2), "no motion in common"),
-        (300, torch.full((300, 2), 6.0), "comes no closer"),
-        (300, 40 * torch.randn(300, 2, generator=torch.Generator().manual_seed(0)), ""),
+        (300, torch.tensor([6.0, 0.0]).repeat(300, 1), "comes no closer"),
+        (300, torch.tensor([0.0, 6.0]).repeat(300, 1), "off their epipolar lines"),
+        (300, 40 * torch.randn(300, 2, generator=torch.Generator().manual_seed(0)), "off their"),
     ],
-    ids=["none", "still", "wrong but unanimous", "chance"],
+    ids=["none", "still", "wrong but unanimous", "across", "chance"],
 )
 def test_useless_matches_leave_the_warp_alone(count: int, step, reason: str) -> None:
     reference, query = orbit_camera(0, size=SIZE), orbit_camera(15, size=SIZE)
@@ -147,6 +150,30 @@ def test_useless_matches_leave_the_warp_alone(count: int, step, reason: str) -> 
     assert reason in found.reason
     assert found.reason
     assert found.error_after == found.error_before
+
+
+def upside_down(truth: torch.Tensor) -> torch.Tensor:
+    return truth.flip(1)
+
+
+def smooth_noise(truth: torch.Tensor) -> torch.Tensor:
+    coarse = torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+    return functional.interpolate(coarse, truth.shape[1:], mode="bicubic").clamp(0, 1)[0]
+
+
+@pytest.mark.parametrize("wrong", [upside_down, smooth_noise])
+@pytest.mark.parametrize("scene", [SPHERE_ON_PLANE, BOX_AND_PLANE], ids=["sphere", "box"])
+def test_a_wrong_truth_corrects_nothing(
+    scene: Scene, wrong: Callable[[torch.Tensor], torch.Tensor]
+) -> None:
+    """Bent far enough, a warp comes closer to any picture, also where the fit did not look."""
+    for seed, (first, second) in enumerate([(0, 12), (20, 5), (0, 25), (40, 60)]):
+        reference, query = (orbit_camera(azimuth, size=SIZE) for azimuth in (first, second))
+        image, truth = speckled(scene, reference), wrong(speckled(scene, query))
+        depth = scene.depth(reference) * smooth_error(seed)
+        found = correct_pair(image, depth, reference, truth, query, FLOW, GRID)
+        assert "off their epipolar lines" in found.reason
+        assert found.flow is None
 
 
 def test_errors_are_compared_over_what_both_warps_show() -> None:

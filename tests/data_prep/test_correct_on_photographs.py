@@ -3,10 +3,13 @@
 `python -m pytest -s -m slow tests/data_prep/test_correct_on_photographs.py`
 """
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from torch.nn import functional
 
 from data_prep import correct
 from data_prep.correct import Correction, correct_pair
@@ -16,6 +19,25 @@ from extrap_train.matching.build import matcher
 from extrap_train.tasks.prepare import prepare_category
 
 GATES = (0.0, 0.01, 0.02, 0.05)
+Picture = torch.Tensor
+
+
+def upside_down(truth: Picture) -> Picture:
+    return truth.flip(1)
+
+
+def mirrored(truth: Picture) -> Picture:
+    return truth.flip(2)
+
+
+def shifted(truth: Picture) -> Picture:
+    """As a wrong pose would."""
+    return truth.roll((25, 25), (1, 2))
+
+
+def smooth_noise(truth: Picture) -> Picture:
+    coarse = torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+    return functional.interpolate(coarse, truth.shape[1:], mode="bicubic").clamp(0, 1)[0]
 
 
 @pytest.fixture(scope="module")
@@ -31,9 +53,12 @@ def apple(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> PreparedDat
     )
 
 
-def corrections(data: PreparedData) -> list[Correction]:
+def corrections(
+    data: PreparedData, truth: Callable[[Picture], Picture] = lambda image: image, every: int = 1
+) -> list[Correction]:
+    """Of every so-manieth training pair, with what `truth` makes of the query's photograph."""
     method, found = matcher(FlowMatcherConfig()), []
-    for pair in data.pairs("train"):
+    for pair in list(data.pairs("train"))[::every]:
         (reference,), query = pair.references, pair.query
         images, depths, _ = data.frames(pair.sequence, [reference, query])
         cameras = data.cameras(pair.sequence)
@@ -42,7 +67,7 @@ def corrections(data: PreparedData) -> list[Correction]:
                 images[0],
                 depths[0],
                 cameras[reference],
-                images[1],
+                truth(images[1]),
                 cameras[query],
                 method,
                 PrepConfig().correction_grid,
@@ -67,3 +92,20 @@ def test_most_pairs_come_closer_and_none_gets_worse(
         print(f"{gate:10.0%} {len(moved):7} {np.median(moved):13.1%}")
     print(f"would be worse: {(gain < 0).sum()}")
     assert (gain >= default).sum() >= 0.8 * pairs
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wrong", [upside_down, mirrored, smooth_noise, shifted])
+def test_a_wrong_truth_corrects_hardly_any_pair(
+    apple: PreparedData, wrong: Callable[[Picture], Picture], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the gate is for: without it, as many pairs come closer to a wrong truth."""
+    found = corrections(apple, wrong, every=2)
+    monkeypatch.setattr(correct, "LARGEST_ACROSS", np.inf)
+    ungated = [c for c in corrections(apple, wrong, every=2) if c.flow is not None]
+    moved = sum(c.flow is not None for c in found)
+    gain = np.median([1 - c.error_after / c.error_before for c in ungated])
+    print(f"\n{wrong.__name__}: {moved} of {len(found)} move; wherever their matches lie,", end=" ")
+    print(f"{len(ungated)} would, by {gain:.1%} in the median")
+    assert moved <= 0.1 * len(found)
+    assert len(ungated) >= 0.5 * len(found)
