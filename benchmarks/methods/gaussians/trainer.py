@@ -70,7 +70,7 @@ def fit(recipe: Recipe, points: Points | None = None, show_progress: bool = Fals
     """Train from the recipe's own initial points, or from those given (in the frame).
 
     The same recipe, points and seed give the same Gaussians on a CPU. Raises InputError without
-    usable points, `Diverged` where the loss stops being finite.
+    usable points, `Diverged` where the loss or anything that is learnt stops being finite.
     """
     options = recipe.options
     schedule = Schedule(options.iterations, options.full_iterations)
@@ -98,6 +98,7 @@ def fit(recipe: Recipe, points: Points | None = None, show_progress: bool = Fals
             count = len(recipe.scene.views)
             order = torch.randperm(count, generator=training.generator).tolist()
         _iterate(recipe, training, modules, order.pop())
+    _check(training, modules)
     return Fit(from_tensors({k: v.detach() for k, v in _tensors(training).items()}), recipe)
 
 
@@ -133,7 +134,17 @@ def _iterate(recipe: Recipe, training: Training, modules: "_ModuleOptimiser", in
         modules.step(progress)
         if not training.optimiser.parameters.means.detach().abs().max() < FARTHEST:
             raise _diverged("a Gaussian left the scene", training)
+    _check(training, modules)
     recipe.adapt(training)
+
+
+def _check(training: Training, modules: "_ModuleOptimiser") -> None:
+    """What a loss of finite numbers can hide: a Gaussian that is NaN is not drawn."""
+    for name, values in _tensors(training).items():
+        if not values.isfinite().all():
+            raise _diverged(f"{name} stopped being finite", training)
+    if not modules.is_finite():
+        raise _diverged("what is learnt beside the Gaussians stopped being finite", training)
 
 
 def _diverged(what: str, training: Training) -> Diverged:
@@ -164,8 +175,13 @@ class _ModuleOptimiser:
         self._rates = [
             (start * schedule.rate_factor, end * schedule.rate_factor) for _, start, end in modules
         ]
+        self._learnt = [value for module, _, _ in modules for value in module.parameters()]
         groups = [{"params": list(module.parameters())} for module, _, _ in modules]
         self._adam = torch.optim.Adam(groups, eps=1e-15, fused=True) if groups else None
+
+    def is_finite(self) -> bool:
+        """Whether no number that is learnt is NaN or infinite."""
+        return all(bool(value.isfinite().all()) for value in self._learnt)
 
     def step(self, progress: float) -> None:
         """One step along the gradients, which are then forgotten."""

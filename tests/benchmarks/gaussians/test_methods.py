@@ -138,6 +138,14 @@ def test_an_optimisation_that_diverges_is_stopped_with_its_iteration() -> None:
         wild.synthesize(inputs)
 
 
+@pytest.mark.parametrize("rate", ["opacity_logits_rate", "log_scales_rate", "quats_rate"])
+def test_no_parameter_diverges_unseen(rate: str) -> None:
+    """A Gaussian that is NaN is not drawn, so that the loss stays finite."""
+    inputs, _ = scene_inputs(size=16)
+    with pytest.raises(Diverged, match=r"in iteration .* of 60; lower the learning rates"):
+        ThreeDgs(**SMALL | {rate: 1e38}).synthesize(inputs)
+
+
 def test_growth_stops_at_the_limit_and_says_so() -> None:
     inputs, _ = scene_inputs(size=24)
     eager = replace(ThreeDgs(**SMALL), densify_from=0, max_gaussians=210, densify_gradient=0.0)
