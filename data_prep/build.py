@@ -5,24 +5,24 @@ import json
 import logging
 import shutil
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from collections.abc import Sequence as ListOf
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from tqdm import tqdm
 
+from data_prep.correct import METHOD as CORRECTION_METHOD
 from data_prep.filter import judge_all
-from data_prep.frames import frames_key
+from data_prep.frames import METHOD, CaptureKeys
 from data_prep.split import Split, split_sequences
 from data_prep.tables import Outcome, write_results
 from data_prep.tools import Tools, put_away
 from data_prep.unit import NO_SPACE, Unit, Workshop, prepare_unit
 from extrap_train.config import DepthConfig, MatcherConfig, PrepConfig
 from extrap_train.data.files import remove_partial
-from extrap_train.data.frame_files import sequence_folder
 from extrap_train.data.sequences import Sequence
-from extrap_train.data.store import FORMAT, PreparedData, read_manifest
+from extrap_train.data.store import FORMAT, PreparedData
 from extrap_train.depth import DepthSource
 from extrap_train.errors import InputError
 from extrap_train.jobs import Died, Launcher
@@ -41,22 +41,35 @@ class _Plan:
     """What decides everything about a preparation but where it runs."""
 
     sequences: ListOf[Sequence]
+    capture_keys: ListOf[str]
     workshop: Workshop
     test_names: Collection[str] | int
+    key: str
+    """A hash of options and captures: the same on every machine."""
+
+    @classmethod
+    def of(
+        cls, sequences: ListOf[Sequence], shop: Workshop, test_names: Collection[str] | int
+    ) -> "_Plan":
+        """Looks at the files of every capture, once."""
+        test = test_names if isinstance(test_names, int) else sorted(test_names)
+        how = [asdict(shop.options), test, repr(shop.tools), METHOD, CORRECTION_METHOD]
+        digest = hashlib.sha256(json.dumps([FORMAT, *how]).encode())
+        depth, size = shop.tools.depth_identity, shop.options.image_size
+        capture_keys = []
+        for sequence in sequences:
+            keys = CaptureKeys.of(sequence)
+            capture_keys.append(keys.frames_key(depth, size))
+            qualities = [sequence.viewpoint_quality, sequence.point_cloud_quality]
+            traits = [sequence.category, sequence.name, qualities, keys.content]
+            digest.update(json.dumps(traits).encode())
+        return cls(sequences, capture_keys, shop, test_names, digest.hexdigest())
 
     @property
-    def key(self) -> str:
-        """A hash of all of it."""
-        test = self.test_names if isinstance(self.test_names, int) else sorted(self.test_names)
-        shop = self.workshop
-        how = [asdict(shop.options), test, shop.correction]
-        digest = hashlib.sha256(json.dumps([FORMAT, *how]).encode())
-        for sequence in self.sequences:
-            qualities = [sequence.viewpoint_quality, sequence.point_cloud_quality]
-            digest.update(json.dumps([sequence.category, sequence.name, qualities]).encode())
-            frames = frames_key(sequence, shop.tools.depth, shop.options.image_size, False)
-            digest.update(frames.encode())
-        return digest.hexdigest()
+    def keys(self) -> dict[str, str]:
+        """What the manifest says: `key`, and `files` of the very files that were read."""
+        files = json.dumps([*self.capture_keys, self.workshop.correction])
+        return {"key": self.key, "files": hashlib.sha256(files.encode()).hexdigest()}
 
 
 def prepare(
@@ -67,6 +80,7 @@ def prepare(
     test_names: Collection[str] | int,
     folder: Path,
     frames: Path | None = None,
+    pairs: Path | None = None,
     matcher: MatcherConfig | Matcher | None = None,
     launcher: Launcher = HERE,
     progress: bool = True,
@@ -74,25 +88,25 @@ def prepare(
 ) -> PreparedData:
     """Make pair data from sequences, or open what an equal earlier call has made.
 
-    `frames` is the folder of the frames, which calls with other pair options may share; the same
-    as `folder` by default. Training warps are corrected where there is a `matcher`. Options of both
-    are made to tools where the jobs run; ready tools go along with the jobs. A sequence that
-    cannot be used is dropped with its reason, and tried again by the next call unless `retry` is
-    False. Finished sequences are kept whatever ends the call. Raises InputError where no sequence
-    is left, or the disk is full.
+    `frames` and `pairs` are the folders of each sequence's frames and pairs, which calls with other
+    options may share; the same as `folder` by default. Training warps are corrected where there is
+    a `matcher`. Options of both are made to tools where the jobs run; ready tools go along with the
+    jobs. A sequence that cannot be used is dropped with its reason, and tried again by the next
+    call unless `retry` is False. Finished sequences are kept whatever ends the call. Raises
+    InputError where no sequence is left, or the disk is full.
     """
-    shop = Workshop(Tools(depth, matcher), options, frames or folder, folder)
-    plan = _Plan(sequences, shop, test_names)
-    key = plan.key
-    if _is_finished(folder, key, retry):
-        LOG.info("%s is prepared already and used as it is", folder)
+    shop = Workshop(Tools(depth, matcher), options, frames or folder, pairs or folder)
+    plan = _Plan.of(sequences, shop, test_names)
+    if _is_finished(plan, folder, retry):
+        print(f"{folder}: prepared already, used as it is")
         return PreparedData.open(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "manifest.json").unlink(missing_ok=True)
         outcomes, split = _make_all(plan, launcher, progress)
-        _remove_partial(shop, sequences)
-        write_results(shop, outcomes, split, key)
+        for place in (folder, *shop.frames.glob("*/*"), *shop.pairs.glob("*/*")):
+            remove_partial(place)
+        write_results(folder, shop, outcomes, split, plan.keys)
     except OSError as error:
         if error.errno not in NO_SPACE:
             raise
@@ -102,23 +116,39 @@ def prepare(
     return PreparedData.open(folder)
 
 
-def _remove_partial(shop: Workshop, sequences: ListOf[Sequence]) -> None:
-    """What killed runs have left half-written."""
-    remove_partial(shop.folder)
-    for category in {sequence.category for sequence in sequences}:
-        for root, kind in ((shop.frames, "frames"), (shop.folder, "pairs")):
-            remove_partial(sequence_folder(root, kind, category))
-
-
-def _is_finished(folder: Path, key: str, retry: bool) -> bool:
+def _is_finished(plan: _Plan, folder: Path, retry: bool) -> bool:
+    """Whether an equal preparation is there and nothing that it stands on has been changed."""
     if not (folder / "manifest.json").exists():
         return False
-    manifest = read_manifest(folder)
-    failed = manifest["sequences"]["failed"]
-    if manifest.get("key") == key and failed and retry:
+    try:
+        data = PreparedData.open(folder)
+    except InputError as error:
+        LOG.warning("%s", error)
+        return False
+    if any(data.manifest.get(name) != key for name, key in plan.keys.items()):
+        print(f"{folder}: photographs, weights or this program have changed: brought up to date")
+        return False
+    failed = data.manifest["sequences"]["failed"]
+    if failed and retry:
         LOG.warning("%s: %d sequences failed before and are tried again", folder, failed)
         return False
-    return bool(manifest.get("key") == key)
+    damaged = [unit.name for unit in _units_of(plan, data) if not unit.is_there]
+    if damaged:
+        LOG.warning(
+            "%s: of %d sequences (%s first) frames or pairs are damaged, gone or other ones by "
+            "now, and are made anew",
+            folder,
+            len(damaged),
+            damaged[0],
+        )
+    return not damaged
+
+
+def _units_of(plan: _Plan, data: PreparedData) -> Iterator[Unit]:
+    for sequence, key in zip(plan.sequences, plan.capture_keys, strict=True):
+        role = data.roles.get(f"{sequence.category}/{sequence.name}")
+        if role:
+            yield Unit(plan.workshop, sequence, role, key)
 
 
 def _make_all(plan: _Plan, launcher: Launcher, progress: bool) -> tuple[list[Outcome], Split]:
@@ -127,11 +157,10 @@ def _make_all(plan: _Plan, launcher: Launcher, progress: bool) -> tuple[list[Out
     Who is tested on depends on who is left, so after failures the split is made anew, and what it
     gives another role is made again.
     """
+    verdicts = judge_all(plan.sequences, plan.workshop.options)
     outcomes = [
-        Outcome(sequence, verdict, failed=False)
-        for sequence, verdict in zip(
-            plan.sequences, judge_all(plan.sequences, plan.workshop.options), strict=True
-        )
+        Outcome(sequence, verdict, failed=False, capture_key=key)
+        for sequence, verdict, key in zip(plan.sequences, verdicts, plan.capture_keys, strict=True)
     ]
     made: dict[str, str] = {}
     while True:
@@ -141,7 +170,12 @@ def _make_all(plan: _Plan, launcher: Launcher, progress: bool) -> tuple[list[Out
         split = split_sequences(list(kept), plan.test_names)
         roles = {name: split.role(name) for name in kept}
         units = [
-            Unit(plan.workshop, outcomes[number].sequence, roles[name])
+            Unit(
+                plan.workshop,
+                outcomes[number].sequence,
+                roles[name],
+                outcomes[number].capture_key,
+            )
             for name, number in kept.items()
             if made.get(name) != roles[name]
         ]

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import logging
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from data_prep.split import held_out
-from extrap_train.config import DepthConfig
+from extrap_train.data.files import file_stamp
 from extrap_train.data.frame_files import SequenceFrames
 from extrap_train.data.images import to_eight_bits
 from extrap_train.data.sequences import Sequence
@@ -23,20 +23,36 @@ LEAST_KNOWN_SHARE = 0.25
 """Of the finer depths under a pixel, for it to have one."""
 MOST_UNUSABLE_SHARE = 0.1
 """Of a sequence's frames, beyond which the whole sequence is not trusted."""
+METHOD = 1
+"""Raised whenever the same photographs give other frames."""
 LOG = logging.getLogger(__name__)
 
 
-def frames_key(
-    sequence: Sequence, depth: DepthConfig | DepthSource, image_size: int, lone: bool
-) -> str:
-    """A hash of what frames are made from: options, names and cameras, not the files' bytes."""
-    digest = hashlib.sha256(json.dumps([image_size, repr(depth), lone]).encode())
-    for frame in sequence.frames:
-        traits = [frame.name, frame.camera.height, frame.camera.width, frame.has_depth]
-        digest.update(json.dumps([*traits, frame.has_mask]).encode())
-        digest.update(frame.camera.world_to_cam.numpy(force=True).tobytes())
-        digest.update(frame.camera.intrinsics.numpy(force=True).tobytes())
-    return digest.hexdigest()
+@dataclass(frozen=True)
+class CaptureKeys:
+    """Hashes that tell captures apart without reading any photograph."""
+
+    content: str
+    """Of names and cameras: the same wherever the capture lies."""
+    files: str
+    """Of sizes and times of the photographs, masks and depth maps."""
+
+    @classmethod
+    def of(cls, sequence: Sequence) -> "CaptureKeys":
+        """Looks at every file's entry in its folder."""
+        content, files = hashlib.sha256(), hashlib.sha256()
+        for frame in sequence.frames:
+            traits = [frame.name, frame.camera.height, frame.camera.width, frame.has_depth]
+            content.update(json.dumps([*traits, frame.has_mask]).encode())
+            content.update(frame.camera.world_to_cam.numpy(force=True).tobytes())
+            content.update(frame.camera.intrinsics.numpy(force=True).tobytes())
+            files.update(json.dumps([file_stamp(file) for file in frame.files]).encode())
+        return cls(content.hexdigest(), files.hexdigest())
+
+    def frames_key(self, depth: str, image_size: int) -> str:
+        """A hash of what frames are made from; `depth` says by what theirs is found."""
+        made_from = [METHOD, image_size, depth, self.content, self.files]
+        return hashlib.sha256(json.dumps(made_from).encode()).hexdigest()
 
 
 def make_frames(

@@ -4,11 +4,11 @@ import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
-import pyarrow.parquet as pq
 import torch
 from jaxtyping import Bool, Float
 
@@ -18,21 +18,32 @@ from data_prep.split import held_out
 from data_prep.tools import Tools
 from extrap_train.config import PrepConfig
 from extrap_train.data.files import whole_folder
-from extrap_train.data.frame_files import FLOWS, StoredFrames, sequence_folder
+from extrap_train.data.frame_files import (
+    FLOWS,
+    StoredFrames,
+    is_sealed,
+    pairs_folder,
+    read_sealed,
+    write_sealed,
+)
 from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
 from extrap_train.matching import Matcher
 
 MIN_DEPTH_SHARE = 0.02
 """A frame with less of its depth known cannot be a reference: its warp would be empty."""
 TABLE = "pairs.parquet"
-_KEY = b"key"
-_PAIR_OPTIONS = (
+_OPTIONS = (
     "max_uses",
     "min_pair_angle_deg",
     "max_pair_angle_deg",
     "near_duplicate_deg",
     "correction_grid",
 )
+
+
+def pair_options(options: PrepConfig) -> dict[str, Any]:
+    """The options that decide about the pairs of a sequence and their corrections."""
+    return {name: getattr(options, name) for name in _OPTIONS}
 
 
 @dataclass(frozen=True)
@@ -47,25 +58,24 @@ class PairFiles:
         cls, root: Path, sequence: str, frames_key: str, role: str, options: PrepConfig, how: str
     ) -> "PairFiles":
         """`how` says by what the warps are corrected; empty where they are not."""
-        traits = {name: getattr(options, name) for name in _PAIR_OPTIONS}
-        content = json.dumps([frames_key, role, traits, how], sort_keys=True)
+        content = json.dumps([frames_key, role, pair_options(options), how], sort_keys=True)
         key = hashlib.sha256(content.encode()).hexdigest()
-        return cls(sequence_folder(root, "pairs", sequence), key)
+        return cls(pairs_folder(root, sequence, role), key)
+
+    def are_there(self) -> bool:
+        """Whole, and made from what the key says."""
+        return is_sealed(self.folder / TABLE, self.key)
 
     def read(self) -> pa.Table | None:
-        """A row a pair, if they are there and made from what the key says."""
-        try:
-            table = pq.read_table(self.folder / TABLE)
-        except (OSError, pa.ArrowInvalid):
-            return None
-        return table if (table.schema.metadata or {}).get(_KEY) == self.key.encode() else None
+        """A row a pair, if they are there."""
+        return read_sealed(self.folder / TABLE, self.key)
 
     def write(self, pairs: pd.DataFrame, flows: Float[np.ndarray, "m 2 g g"]) -> None:
         """Both files, whole or not at all."""
-        with whole_folder(self.folder, lambda _: self.read() is not None) as made:
+        with whole_folder(self.folder, lambda _: self.are_there()) as made:
             np.save(made / FLOWS, flows.astype(np.float16))
             table = pa.Table.from_pandas(pairs, preserve_index=False)
-            pq.write_table(table.replace_schema_metadata({_KEY: self.key.encode()}), made / TABLE)
+            write_sealed(table, made / TABLE, self.key)
 
 
 def reference_frames(depth_share: Float[np.ndarray, "n"], lone: bool) -> Bool[np.ndarray, "n"]:
@@ -135,7 +145,7 @@ def make_pairs(
     tools: Tools,
 ) -> None:
     """Choose and correct a sequence's pairs, unless they are there already."""
-    if files.read() is not None:
+    if files.are_there():
         return
     with torch.inference_mode():
         chosen = choose_pairs(frames, name, role, options)

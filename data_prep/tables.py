@@ -36,6 +36,8 @@ class Outcome:
     verdict: Verdict
     failed: bool
     """Whether it was good enough, but could not be prepared."""
+    capture_key: str
+    """What its frames are made from (`CaptureKeys.frames_key`)."""
 
     @property
     def name(self) -> str:
@@ -43,13 +45,18 @@ class Outcome:
         return f"{self.sequence.category}/{self.sequence.name}"
 
 
-def write_results(shop: Workshop, outcomes: list[Outcome], split: Split, key: str) -> None:
+def write_results(
+    folder: Path, shop: Workshop, outcomes: list[Outcome], split: Split, keys: dict[str, str]
+) -> None:
     """All tables, then the manifest, whose presence says that they are complete."""
-    folder = shop.folder
-    units = [Unit(shop, o.sequence, split.role(o.name)) for o in outcomes if o.verdict.kept]
+    units = [
+        Unit(shop, outcome.sequence, split.role(outcome.name), outcome.capture_key)
+        for outcome in outcomes
+        if outcome.verdict.kept
+    ]
     counts = _write_frames_and_pairs(folder, units)
     parts: Counter[str] = Counter()
-    for (_, part), count in counts.items():
+    for (_, part), count in counts.pairs.items():
         parts[part] += count
     if not parts["train"]:
         raise InputError(
@@ -63,10 +70,11 @@ def write_results(shop: Workshop, outcomes: list[Outcome], split: Split, key: st
     failed = sum(outcome.failed for outcome in outcomes)
     manifest = {
         "format": FORMAT,
-        "key": key,
+        **keys,
         "options": asdict(shop.options),
         "correction": None if shop.tools.correction is None else repr(shop.tools.correction),
         "frames": os.path.relpath(shop.frames, folder),
+        "pair_files": os.path.relpath(shop.pairs, folder),
         "split": json.loads(split.to_json())["sha256"],
         "sequences": {
             "kept": len(units),
@@ -79,9 +87,19 @@ def write_results(shop: Workshop, outcomes: list[Outcome], split: Split, key: st
     write_whole(folder / "manifest.json", (json.dumps(manifest, indent=1) + "\n").encode())
 
 
-def _write_frames_and_pairs(folder: Path, units: list[Unit]) -> Counter[tuple[str, str]]:
-    """Both tables from the sequences' own, one after the other; pairs by sequence and split."""
-    counts: Counter[tuple[str, str]] = Counter()
+@dataclass(frozen=True)
+class _Counts:
+    """How many there are of what is stored."""
+
+    frames: Counter[str]
+    """By sequence."""
+    pairs: Counter[tuple[str, str]]
+    """By sequence and split."""
+
+
+def _write_frames_and_pairs(folder: Path, units: list[Unit]) -> _Counts:
+    """Both tables from the sequences' own, one after the other."""
+    counts = _Counts(Counter(), Counter())
     with (
         _writer(folder / "frames.parquet") as write_frames,
         _writer(folder / "pairs.parquet") as write_pairs,
@@ -95,35 +113,41 @@ def _write_frames_and_pairs(folder: Path, units: list[Unit]) -> Counter[tuple[st
                 )
             write_frames(_frame_rows(unit, cameras))
             write_pairs(pairs.replace_schema_metadata(None))
-            for part in pairs["split"].to_pylist():
-                counts[unit.name, part] += 1
+            counts.frames[unit.name] = cameras.num_rows
+            counts.pairs.update((unit.name, part) for part in pairs["split"].to_pylist())
     return counts
 
 
 def _frame_rows(unit: Unit, cameras: pa.Table) -> pa.Table:
     shares = cameras["depth_share"].to_numpy()
-    references = reference_frames(shares, unit.role == "train and test")
+    references = reference_frames(shares, unit.is_lone)
     names = pa.array([unit.name] * cameras.num_rows, pa.string())
     rows = cameras.replace_schema_metadata(None).add_column(0, "sequence", names)
     return rows.append_column("reference", pa.array(references))
 
 
-def _sequence_rows(
-    outcomes: list[Outcome], split: Split, counts: Counter[tuple[str, str]]
-) -> pd.DataFrame:
+def _sequence_rows(outcomes: list[Outcome], split: Split, counts: _Counts) -> pd.DataFrame:
     rows: list[dict[str, Any]] = [
         {
             "sequence": outcome.name,
             **asdict(outcome.verdict),
+            **_frame_counts(outcome, counts),
             "failed": outcome.failed,
             "viewpoint_quality": outcome.sequence.viewpoint_quality,
             "point_cloud_quality": outcome.sequence.point_cloud_quality,
             "split": split.role(outcome.name) if outcome.verdict.kept else "",
-            "pairs": sum(counts[outcome.name, part] for part in ("train", "test")),
+            "pairs": sum(counts.pairs[outcome.name, part] for part in ("train", "test")),
         }
         for outcome in outcomes
     ]
     return pd.DataFrame(rows)
+
+
+def _frame_counts(outcome: Outcome, counts: _Counts) -> dict[str, int]:
+    """Stored frames, and those that could not be used; of a dropped sequence all that it has."""
+    taken = outcome.verdict.frames
+    stored = counts.frames[outcome.name] if outcome.verdict.kept else taken
+    return {"frames": stored, "frames_left_out": taken - stored}
 
 
 class _Rows:

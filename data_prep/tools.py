@@ -8,11 +8,20 @@ import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 from typing import TypeVar
 
 import torch
 
-from extrap_train.config import DepthConfig, MatcherConfig
+from extrap_train.config import (
+    AlikedMatcherConfig,
+    DepthConfig,
+    LoftrMatcherConfig,
+    Mast3rConfig,
+    MatcherConfig,
+    MonocularConfig,
+)
+from extrap_train.data.files import file_stamp
 from extrap_train.depth import DepthSource
 from extrap_train.depth.build import depth_source
 from extrap_train.matching import Matcher
@@ -33,6 +42,16 @@ class Tools:
     correction: MatcherConfig | Matcher | None
     """What warps are corrected with; None leaves them."""
 
+    @property
+    def depth_identity(self) -> str:
+        """What decides about depth: options, and which files of weights they name."""
+        return _identity(self.depth)
+
+    @property
+    def correction_identity(self) -> str:
+        """What decides about corrections; empty where there are none."""
+        return "" if self.correction is None else _identity(self.correction)
+
     def depth_source(self) -> DepthSource:
         """On the GPU of this process, where it has one."""
         return (
@@ -51,6 +70,20 @@ class Tools:
             depth_source(self.depth, cpu)
         if isinstance(self.correction, MatcherConfig):
             matcher(self.correction, device=cpu)
+
+
+def _identity(tool: object) -> str:
+    return f"{tool!r} {[file_stamp(file) for file in _weight_files(tool)]}"
+
+
+def _weight_files(tool: object) -> list[Path]:
+    match tool:
+        case Mast3rConfig() | LoftrMatcherConfig() | AlikedMatcherConfig():
+            return [Path(tool.checkpoint or "")]
+        case MonocularConfig():
+            return [*sorted(Path(tool.model).glob("*")), *_weight_files(tool.matcher)]
+        case _:
+            return []
 
 
 def put_away() -> None:

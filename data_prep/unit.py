@@ -11,13 +11,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from data_prep.correct import METHOD
-from data_prep.frames import frames_key, make_frames
+from data_prep.frames import make_frames
 from data_prep.pairs import PairFiles, make_pairs
 from data_prep.tools import Tools
 from extrap_train.config import PrepConfig
 from extrap_train.data.frame_files import (
+    CAMERAS,
     StoredFrames,
     frames_folder,
+    is_sealed,
     read_camera_table,
     write_frames,
 )
@@ -37,14 +39,14 @@ class Workshop:
     options: PrepConfig
     frames: Path
     """Root of the frames, which preparations with other pair options share."""
-    folder: Path
-    """Root of the pairs."""
+    pairs: Path
+    """Root of the pairs and their corrections, which preparations of other sequences share."""
 
     @property
     def correction(self) -> str:
         """How warps are corrected; empty where they are not."""
-        how = self.tools.correction
-        return "" if how is None else f"{how!r}, method {METHOD}"
+        how = self.tools.correction_identity
+        return how and f"{how}, method {METHOD}"
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,8 @@ class Unit:
     sequence: Sequence
     role: str
     """`train`, `test` or `train and test` (`split.Split.role`)."""
+    capture_key: str
+    """What its frames are made from (`CaptureKeys.frames_key`), but for the role."""
 
     @property
     def name(self) -> str:
@@ -62,22 +66,33 @@ class Unit:
         return f"{self.sequence.category}/{self.sequence.name}"
 
     @property
+    def is_lone(self) -> bool:
+        """Whether frames of it are held out."""
+        return self.role == "train and test"
+
+    @property
     def frames_key(self) -> str:
         """What the frames are made from."""
-        shop, lone = self.workshop, self.role == "train and test"
-        return frames_key(self.sequence, shop.tools.depth, shop.options.image_size, lone)
+        return f"{self.capture_key}{' with frames held out' if self.is_lone else ''}"
 
     @property
     def frames_folder(self) -> Path:
         """Where they lie."""
-        return frames_folder(self.workshop.frames, self.name)
+        return frames_folder(self.workshop.frames, self.name, self.is_lone)
+
+    @property
+    def is_there(self) -> bool:
+        """Whether frames and pairs are whole and made from what is asked for."""
+        return is_sealed(self.frames_folder / CAMERAS, self.frames_key) and (
+            self.pair_files.are_there()
+        )
 
     @property
     def pair_files(self) -> PairFiles:
         """Where the pairs lie, and what they are made from."""
         shop = self.workshop
         made_from = (self.frames_key, self.role, shop.options, shop.correction)
-        return PairFiles.of(shop.folder, self.name, *made_from)
+        return PairFiles.of(shop.pairs, self.name, *made_from)
 
 
 def prepare_unit(unit: Unit) -> str:
@@ -104,9 +119,8 @@ def _prepare(unit: Unit) -> None:
     shop, key = unit.workshop, unit.frames_key
     table = read_camera_table(unit.frames_folder, key)
     if table is None:
-        lone = unit.role == "train and test"
         source = shop.tools.depth_source()
-        frames = make_frames(unit.sequence, source, shop.options.image_size, lone)
+        frames = make_frames(unit.sequence, source, shop.options.image_size, unit.is_lone)
         write_frames(unit.frames_folder, frames, key)
         table = read_camera_table(unit.frames_folder, key)
         assert table is not None

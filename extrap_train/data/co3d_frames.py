@@ -40,6 +40,11 @@ class _Photograph:
     def name(self) -> str:
         return self.image_path.rpartition("/")[2]
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        depth = (self.depth.path, self.depth.mask_path) if self.depth else ()
+        return tuple(self.root / p for p in (self.image_path, self.mask_path, *depth) if p)
+
     def load(self) -> View:
         size = self.camera.height, self.camera.width
         mask_path = self.mask_path and resolve_inside(self.root, self.mask_path)
@@ -141,6 +146,7 @@ class Co3dFrames(ListOf[Frame]):
             has_depth=photograph.depth is not None,
             has_mask=photograph.mask_path is not None,
             load=photograph.load,
+            files=photograph.files,
         )
 
     def _depth(self, index: int) -> DepthFiles | None:

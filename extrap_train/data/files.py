@@ -65,6 +65,18 @@ def resolve_inside(root: Path, relative: str) -> Path:
     return resolved
 
 
+def file_stamp(path: Path) -> tuple[int, int] | None:
+    """Size in bytes and time of the last change in nanoseconds; None where there is no such file.
+
+    What says, without reading it, that a file is another one now.
+    """
+    try:
+        found = path.stat()
+    except (OSError, ValueError):
+        return None
+    return found.st_size, found.st_mtime_ns
+
+
 def partial_beside(path: Path) -> Path:
     """Where this process writes what is to become `path`; says whose it is (`remove_partial`)."""
     return path.with_name(f".{path.name}.{_host()}-{os.getpid()}.tmp")

@@ -1,5 +1,6 @@
 """The folder of one prepared sequence: what is in it, and how it gets there whole or not at all."""
 
+import json
 import math
 import re
 from dataclasses import dataclass
@@ -13,13 +14,13 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from extrap_train.data.files import whole_folder
+from extrap_train.data.files import file_stamp, whole_folder
 from extrap_train.views import Camera
 
 FLOWS = "flows.npy"
 """Of the pairs of one sequence, beside their table: control vectors (`geometry.flow`)."""
 IMAGES, DEPTHS, MASKS, CAMERAS = "images.npy", "depth.npy", "mask.npy", "frames.parquet"
-_KEY = b"key"
+_KEY, _SIZES = b"key", b"sizes"
 _SAFE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}")
 
 
@@ -75,9 +76,17 @@ def sequence_folder(root: Path, kind: str, sequence: str) -> Path:
     return root.joinpath(kind, *(_safe(part) for part in sequence.split("/", 1)))
 
 
-def frames_folder(root: Path, sequence: str) -> Path:
-    """Where the frames of `category/name` lie."""
-    return sequence_folder(root, "frames", sequence)
+def frames_folder(root: Path, sequence: str, lone: bool = False) -> Path:
+    """Where the frames of `category/name` lie.
+
+    Those of a `lone` sequence, some of which are held out and have no depth, lie apart.
+    """
+    return sequence_folder(root, "lone_frames" if lone else "frames", sequence)
+
+
+def pairs_folder(root: Path, sequence: str, role: str) -> Path:
+    """Where the pairs of `category/name` lie; those of each role lie apart."""
+    return sequence_folder(root, f"{role} pairs".replace(" ", "_"), sequence)
 
 
 def matrices_of(table: pa.Table, column: str, shape: tuple[int, int]) -> Float[Tensor, "n r c"]:
@@ -95,25 +104,47 @@ def write_frames(folder: Path, frames: SequenceFrames, key: str) -> None:
     scale = _depth_scale(frames.depths)
     scaled = frames.depths / scale
     scaled[scaled > np.finfo(np.float16).max] = 0
-    with whole_folder(folder, lambda there: read_camera_table(there, key) is not None) as made:
+    with whole_folder(folder, lambda there: is_sealed(there / CAMERAS, key)) as made:
         np.save(made / IMAGES, frames.images)
         np.save(made / DEPTHS, scaled.astype(np.float16))
         np.save(made / MASKS, frames.masks)
-        pq.write_table(_camera_table(frames, scale, key), made / CAMERAS)
+        write_sealed(_camera_table(frames, scale), made / CAMERAS, key)
 
 
 def read_camera_table(folder: Path, key: str) -> pa.Table | None:
     """One row a frame, if the folder holds a whole sequence made from what `key` says."""
+    return read_sealed(folder / CAMERAS, key)
+
+
+def write_sealed(table: pa.Table, file: Path, key: str) -> None:
+    """Write a table with `key`, what it was made from, and the sizes of the files beside it."""
+    sizes = {path.name: path.stat().st_size for path in sorted(file.parent.iterdir())}
+    seal = {_KEY: key.encode(), _SIZES: json.dumps(sizes).encode()}
+    pq.write_table(table.replace_schema_metadata(seal), file)
+
+
+def is_sealed(file: Path, key: str) -> bool:
+    """Whether a table is there, made from `key`, and the files beside it are still as long."""
     try:
-        table = pq.read_table(folder / CAMERAS)
+        seal = pq.read_schema(file).metadata or {}
+        sizes = json.loads(seal.get(_SIZES, b"null"))
+    except (OSError, ValueError):
+        return False
+    if seal.get(_KEY) != key.encode() or sizes is None:
+        return False
+    stamps = ((file_stamp(file.with_name(name)), size) for name, size in sizes.items())
+    return all(stamp is not None and stamp[0] == size for stamp, size in stamps)
+
+
+def read_sealed(file: Path, key: str) -> pa.Table | None:
+    """The table, if `is_sealed`."""
+    try:
+        return pq.read_table(file) if is_sealed(file, key) else None
     except (OSError, pa.ArrowInvalid):
         return None
-    complete = all((folder / name).is_file() for name in (IMAGES, DEPTHS, MASKS))
-    made_from = (table.schema.metadata or {}).get(_KEY, b"").decode()
-    return table if complete and made_from == key else None
 
 
-def _camera_table(frames: SequenceFrames, depth_scale: float, key: str) -> pa.Table:
+def _camera_table(frames: SequenceFrames, depth_scale: float) -> pa.Table:
     count = len(frames.names)
     columns = {
         "index": pa.array(range(count), pa.int32()),
@@ -123,7 +154,7 @@ def _camera_table(frames: SequenceFrames, depth_scale: float, key: str) -> pa.Ta
         "depth_share": pa.array((frames.depths > 0).mean((1, 2)), pa.float32()),
         "depth_scale": pa.array([depth_scale] * count, pa.float32()),
     }
-    return pa.table(columns).replace_schema_metadata({_KEY: key.encode()})
+    return pa.table(columns)
 
 
 def _matrices(matrices: Float[np.ndarray, "n r c"]) -> pa.Array:

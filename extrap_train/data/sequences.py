@@ -20,6 +20,8 @@ class Frame:
     has_mask: bool
     load: Callable[[], View]
     """Reads image, depth and mask at full resolution; raises InputError that names the file."""
+    files: tuple[Path, ...] = ()
+    """What `load` reads."""
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,12 @@
          frames.parquet      a row a frame: name, camera, whether it may serve as a reference
          pairs.parquet       a row an ordered pair (reference → query)
          split.json          test sequences (or frames), with a hash
-         pairs/<category>/<sequence>/flows.npy, pairs.parquet
 <frames>/frames/<category>/<sequence>/{images,depth,mask}.npy, frames.parquet
+         lone_frames/…       of a sequence that is trained and tested on, with frames held out
+<pairs>/train_pairs/<category>/<sequence>/flows.npy, pairs.parquet
+        test_pairs/…, train_and_test_pairs/…
 
-Frames lie in a folder that other preparations may share; the manifest says which.
+Frames and pairs lie in folders that other preparations may share; the manifest says which.
 """
 
 import json
@@ -33,12 +35,12 @@ from extrap_train.data.frame_files import (
     MASKS,
     frames_folder,
     matrices_of,
-    sequence_folder,
+    pairs_folder,
 )
 from extrap_train.errors import InputError
 from extrap_train.views import Camera, ViewPair
 
-FORMAT = 2
+FORMAT = 3
 UNTOUCHED = -1
 """In place of the number of a flow: the warp of that pair stays as it is."""
 _OPEN_SEQUENCES = 128
@@ -99,7 +101,10 @@ class PreparedData:
         self._reference = frames["reference"].to_numpy()
         self._names = frames["name"]
         self._rows = _row_ranges(frames["sequence"].to_numpy())
+        self.roles: dict[str, str] = _roles(sequences)
+        """`train`, `test` or `train and test` of every sequence that is kept."""
         self._frames_root = folder / manifest["frames"]
+        self._pairs_root = folder / manifest["pair_files"]
         self._pair_rows = _row_ranges(pairs["sequence"].to_numpy())
         self._flow_numbers: Callable[[str], np.ndarray] = lru_cache(_OPEN_SEQUENCES)(
             self._read_flow_numbers
@@ -187,14 +192,15 @@ class PreparedData:
         return numbers
 
     def _open_flows(self, sequence: str) -> np.ndarray:
-        file = sequence_folder(self.folder, "pairs", sequence) / FLOWS
+        folder = pairs_folder(self._pairs_root, sequence, self.roles[sequence])
         try:
-            return np.load(file, mmap_mode="r")
+            return np.load(folder / FLOWS, mmap_mode="r")
         except (OSError, ValueError, EOFError) as error:
-            raise _damaged(self.folder, f"{file}: {error}") from None
+            raise _damaged(folder, str(error)) from None
 
     def _open_arrays(self, sequence: str) -> Arrays:
-        folder = frames_folder(self._frames_root, sequence)
+        is_lone = self.roles[sequence] == "train and test"
+        folder = frames_folder(self._frames_root, sequence, is_lone)
         count = self._rows[sequence].stop - self._rows[sequence].start
         square = (count, self.image_size, self.image_size)
         try:
@@ -202,9 +208,9 @@ class PreparedData:
                 np.load(folder / name, mmap_mode="r") for name in (IMAGES, DEPTHS, MASKS)
             )
         except (OSError, ValueError, EOFError) as error:
-            raise _damaged(self.folder, f"{folder}: {error}") from None
+            raise _damaged(folder, str(error)) from None
         if images.shape != (*square, 3) or depths.shape != square or masks.shape != square:
-            raise _damaged(self.folder, f"{folder}: frames are not {square}")
+            raise _damaged(folder, f"frames are not {square}")
         return images, depths, masks
 
     def __reduce__(self) -> tuple[Callable[[Path], "PreparedData"], tuple[Path]]:
@@ -222,7 +228,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise _damaged(folder, f"{file}: {error}") from None
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-        raise _damaged(folder, f"{file} is not a manifest of format {FORMAT}")
+        raise _damaged(folder, f"{file} is no manifest of format {FORMAT}")
     return manifest
 
 
@@ -236,7 +242,14 @@ def _read_table(folder: Path, name: str) -> pa.Table:
 
 
 def _damaged(folder: Path, what: str) -> InputError:
-    return InputError(f"{folder} is damaged ({what}); delete that folder and run data_prep again")
+    return InputError(
+        f"{folder} is damaged ({what}); run data_prep again, which makes anew what is damaged"
+    )
+
+
+def _roles(sequences: pd.DataFrame) -> dict[str, str]:
+    kept = sequences[sequences["kept"]]
+    return dict(zip(kept["sequence"], kept["split"], strict=True))
 
 
 def _row_ranges(sequences: np.ndarray) -> dict[str, slice]:

@@ -13,6 +13,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from data_prep.build import prepare
+from data_prep.pairs import pair_options
 from data_prep.synthesize import synthesize
 from data_prep.tools import Tools
 from extrap_train.config import (
@@ -53,10 +54,14 @@ def prepare_category(
     """
     how = matcher if is_corrected(data, depth, prep) else None
     Tools(depth, how).check()  # before anything is rendered
-    made_from = [category, asdict(data), asdict(depth)]
-    digest = _digest([*made_from, asdict(prep), asdict(how) if how else None])
-    folder = output / "data" / f"{category}-{digest}"
-    frames = output / "frames" / f"{category}-{_digest([*made_from, prep.image_size])}"
+    correction = asdict(how) if how else None
+    frames_of = [category, _source(data), asdict(depth), prep.image_size]
+    pairs_of = [*frames_of, pair_options(prep), correction]
+    all_of = [category, asdict(data), asdict(depth), asdict(prep), correction]
+    frames, pairs, folder = (
+        output / kind / f"{category}-{_digest(made_of)}"
+        for kind, made_of in (("frames", frames_of), ("pairs", pairs_of), ("data", all_of))
+    )
     folder.parent.mkdir(parents=True, exist_ok=True)
     with (
         _alone(folder.parent / f".{category}.lock"),
@@ -70,6 +75,7 @@ def prepare_category(
             test_names=test_names,
             folder=folder,
             frames=frames,
+            pairs=pairs,
             matcher=how,
             launcher=opened,
             retry=retry,
@@ -107,6 +113,12 @@ def _sequences(
     assert isinstance(data, Co3dConfig)
     assert data.root is not None
     return read_category(Path(data.root), category), data.test_sequences
+
+
+def _source(data: DataConfig) -> dict[str, Any]:
+    """What a photograph depends on: not on how many sequences are for what."""
+    counts = ("test_sequences", "train_sequences")
+    return {name: value for name, value in asdict(data).items() if name not in counts}
 
 
 def _digest(parts: list[Any]) -> str:

@@ -1,6 +1,5 @@
 import errno
 import json
-import logging
 import os
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
@@ -53,16 +52,15 @@ def captures(count: int, **traits):
 
 
 def test_a_second_run_does_nothing_and_says_so(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     depth = CountingDepth(calls=([],))
     first = run(tmp_path / "cup", captures(3), depth=depth)
     before = {p: p.stat().st_mtime_ns for p in (tmp_path / "cup").rglob("*")}
-    with caplog.at_level(logging.INFO):
-        second = run(tmp_path / "cup", captures(3), depth=depth)
+    second = run(tmp_path / "cup", captures(3), depth=depth)
     assert len(depth.calls[0]) == 3
     assert before == {p: p.stat().st_mtime_ns for p in (tmp_path / "cup").rglob("*")}
-    assert "prepared already" in caplog.text
+    assert "prepared already" in capsys.readouterr().out
     assert first.manifest == second.manifest
 
 

@@ -5,6 +5,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+import torch
 from captures import write_capture
 
 from extrap_train.config import Co3dConfig, DatasetDepthConfig, FlowMatcherConfig, PrepConfig
@@ -57,6 +58,9 @@ def test_damaged_sequences_are_reported_and_the_rest_goes_on(
     assert "2 of 12 frames cannot be used" in reasons["cup/two_corrupt"]
     assert f"{first_of_two}: is truncated or damaged" in reasons["cup/two_corrupt"]
     assert reasons["cup/no_depth"] in caplog.text
+    counts = data.sequences.set_index("sequence")[["frames", "frames_left_out"]]
+    assert counts.loc["cup/one_corrupt"].tolist() == [FRAMES - 1, 1]
+    assert counts.loc["cup/fine"].tolist() == [FRAMES, 0]
     # One in twelve is no reason to give a sequence up.
     assert corrupt.name not in data.names("cup/one_corrupt")
     assert len(data.names("cup/one_corrupt")) == FRAMES - 1
@@ -66,10 +70,28 @@ def test_damaged_sequences_are_reported_and_the_rest_goes_on(
 def test_a_restored_sequence_is_taken_in_and_nothing_else_redone(photographs: Path) -> None:
     depths = photographs / "cup" / "no_depth" / "depths"
     depths.rename(photographs / "elsewhere")
-    first = prepared(photographs)
-    files = {f: f.stat().st_mtime_ns for f in first.folder.glob("pairs/cup/*/pairs.parquet")}
+    prepared(photographs)
+    outputs = photographs.parent / "outputs"
+    files = {f: f.stat().st_mtime_ns for f in outputs.glob("pairs/*/*/cup/*/pairs.parquet")}
     (photographs / "elsewhere").rename(depths)
     second = prepared(photographs)
     assert len(files) == len(NAMES) - 1
     assert second.manifest["sequences"] == {"kept": len(NAMES), "dropped": 0, "failed": 0}
     assert {file: file.stat().st_mtime_ns for file in files} == files
+
+
+def test_a_restored_and_a_replaced_photograph_are_taken_in(photographs: Path) -> None:
+    frames = photographs.parent / "outputs" / "frames"
+    whole = sorted((photographs / "cup" / "fine" / "images").iterdir())[5].read_bytes()
+    corrupt = cut_short(photographs, "fine", 5)
+    assert corrupt.name not in prepared(photographs).names("cup/fine")
+    others = {f: f.stat().st_mtime_ns for f in frames.rglob("*.npy") if f.parent.name != "fine"}
+    corrupt.write_bytes(whole)
+    restored = prepared(photographs)
+    assert restored.names("cup/fine")[5] == corrupt.name
+    before = restored.frames("cup/fine", [5, 6])[0]
+    corrupt.write_bytes(corrupt.with_name(restored.names("cup/fine")[6]).read_bytes())
+    after = prepared(photographs).frames("cup/fine", [5, 6])[0]
+    assert (after[0] - before[0]).abs().max() > 0.1
+    assert torch.equal(after[1], before[1])
+    assert {file: file.stat().st_mtime_ns for file in others} == others

@@ -55,7 +55,7 @@ def wait_until(condition: Callable[[], bool], run: "subprocess.Popen[str]") -> N
 
 
 def finished(output: Path) -> list[Path]:
-    return list(output.glob("data/cup-*/pairs/cup/s*/pairs.parquet"))
+    return list(output.glob("pairs/cup-*/*_pairs/cup/s*/pairs.parquet"))
 
 
 def contents(output: Path) -> dict[str, bytes]:

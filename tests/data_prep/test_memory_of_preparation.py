@@ -84,7 +84,7 @@ def test_a_job_takes_its_own_sequence_along_and_no_other(photographs: Path) -> N
     shop = Workshop(Tools(DatasetDepthConfig(), None), PrepConfig(), photographs, photographs)
 
     def job(sequences: list[Sequence]) -> int:
-        return len(pickle.dumps(Unit(shop, sequences[0], "train")))
+        return len(pickle.dumps(Unit(shop, sequences[0], "train", "key")))
 
     annotate(photographs, 2)
     few = job(read_category(photographs, "cup"))

@@ -55,7 +55,7 @@ def test_a_job_is_small_and_keeps_no_file_open(mast3r: Mast3rConfig, tmp_path: P
     tools = Tools(mast3r, LoftrMatcherConfig(checkpoint="loftr.ckpt"))
     shop = Workshop(tools, PrepConfig(), tmp_path, tmp_path)
     before = open_files()
-    job = ForkingPickler.dumps(Unit(shop, Sequence("cup", "one", ()), "train"))
+    job = ForkingPickler.dumps(Unit(shop, Sequence("cup", "one", ()), "train", "key"))
     assert open_files() == before
     assert len(job) < 2000
 

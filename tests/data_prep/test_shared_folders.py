@@ -1,0 +1,121 @@
+"""Preparations that share frames and pairs: none changes another's or redoes what is there."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from captures import write_capture
+from orbits import capture, even, ring
+
+from data_prep.build import prepare
+from extrap_train.config import Co3dConfig, DatasetDepthConfig, FlowMatcherConfig, PrepConfig
+from extrap_train.data.frame_files import frames_folder, pairs_folder
+from extrap_train.data.sequences import Sequence
+from extrap_train.data.store import PreparedData
+from extrap_train.tasks.prepare import prepare_category
+
+OPTIONS = PrepConfig(image_size=16)
+HELD_OUT = [4, 9, 14, 19]
+
+
+def run(root: Path, name: str, sequences: list[Sequence], options: PrepConfig) -> PreparedData:
+    return prepare(
+        sequences,
+        DatasetDepthConfig(),
+        options,
+        test_names=1,
+        folder=root / name,
+        frames=root / "frames",
+        pairs=root / "pairs",
+        progress=False,
+    )
+
+
+def times(*folders: Path) -> dict[Path, int]:
+    """When the files below folders were written; locks are none."""
+    files = (file for folder in folders for file in folder.rglob("*") if file.is_file())
+    return {file: file.stat().st_mtime_ns for file in files if file.suffix != ".lock"}
+
+
+def test_a_lone_sequences_held_out_frames_stay_hidden_whoever_else_needs_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sequences = [
+        capture(ring(even(24)), name, viewpoint_quality=quality)
+        for name, quality in (("good", 0.5), ("poor", -0.5))
+    ]
+    strict = run(tmp_path, "strict", sequences, OPTIONS)
+    assert strict.roles == {"cup/good": "train and test"}
+    loose = run(tmp_path, "loose", sequences, replace(OPTIONS, min_viewpoint_quality=-1.0))
+    assert sorted(loose.roles.values()) == ["test", "train"]
+    assert loose.frames("cup/good", HELD_OUT)[1].all()
+    again = run(tmp_path, "strict", sequences, OPTIONS)
+    assert f"{tmp_path / 'strict'}: prepared already" in capsys.readouterr().out
+    for data in (strict, again):
+        assert not data.frames("cup/good", HELD_OUT)[1].any()
+
+
+@pytest.mark.parametrize("part", ["images.npy", "depth.npy", "frames.parquet", "flows.npy"])
+@pytest.mark.parametrize("content", [None, b"", b"half of it"])
+def test_damage_is_noticed_and_mended_by_the_same_command(
+    part: str, content: bytes | None, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    sequences = [capture(ring(even(9)), name) for name in ("a", "b", "c")]
+    options = replace(OPTIONS, max_gap_deg=60.0)
+    data = run(tmp_path, "cup", sequences, options)
+    folder = frames_folder(tmp_path / "frames", "cup/b")
+    if part == "flows.npy":
+        folder = pairs_folder(tmp_path / "pairs", "cup/b", data.roles["cup/b"])
+    whole, before = (folder / part).read_bytes(), times(tmp_path / "frames", tmp_path / "pairs")
+    if content is None:
+        (folder / part).unlink()
+    else:
+        (folder / part).write_bytes(content)
+    run(tmp_path, "cup", sequences, options).frames("cup/b", range(9))
+    assert "of 1 sequences (cup/b first) frames or pairs are damaged" in caplog.text
+    assert (folder / part).read_bytes() == whole
+    after = times(tmp_path / "frames", tmp_path / "pairs")
+    assert {file.parent for file in before if after[file] != before[file]} == {folder}
+
+
+def test_a_damaged_manifest_is_made_anew(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    sequences = [capture(ring(even(24)), name) for name in ("a", "b")]
+    run(tmp_path, "cup", sequences, OPTIONS)
+    manifest = tmp_path / "cup" / "manifest.json"
+    whole = manifest.read_bytes()
+    manifest.write_bytes(whole[:100])
+    run(tmp_path, "cup", sequences, OPTIONS)
+    assert "is damaged" in caplog.text
+    assert manifest.read_bytes() == whole
+
+
+def test_a_changed_option_redoes_only_what_depends_on_it(tmp_path: Path) -> None:
+    names = ("one", "two", "three", "four")
+    write_capture(tmp_path / "co3d", names, 12)
+    output = tmp_path / "outputs"
+
+    def prepared(tests: int, **options: object) -> PreparedData:
+        return prepare_category(
+            "cup",
+            Co3dConfig(root=str(tmp_path / "co3d"), test_sequences=tests),
+            DatasetDepthConfig(),
+            PrepConfig(image_size=16, max_uses=2, max_gap_deg=40.0, **options),
+            output=output,
+            workers=1,
+            matcher=FlowMatcherConfig(),
+        )
+
+    first = prepared(1, correct=True)
+    frames, pairs = times(output / "frames"), times(output / "pairs")
+    second = prepared(2, correct=True)
+    assert sorted(first.roles.values()).count("test") == 1
+    assert sorted(second.roles.values()).count("test") == 2
+    (changed,) = (name for name in first.roles if first.roles[name] != second.roles[name])
+    new = times(output / "pairs").keys() - pairs.keys()
+    assert {file.parent.name for file in new} == {changed.removeprefix("cup/")}
+    prepared(1, correct=True, min_viewpoint_quality=-1.0)
+    prepared(1, correct=None)
+    assert times(output / "pairs").keys() == pairs.keys() | new
+    prepared(1, correct=False)
+    assert times(output / "frames") == frames
+    assert times(output / "pairs").items() >= pairs.items()
