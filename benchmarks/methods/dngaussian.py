@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from benchmarks.methods.gaussians.checks import check_range, check_word
 from benchmarks.methods.gaussians.density import remove
 from benchmarks.methods.gaussians.depth_losses import (
     edge_aware_smoothness,
@@ -80,6 +81,16 @@ class DnGaussian(GaussianMethod):
     """Half the side of the cube that the grid covers, in extents."""
     grid_rate: float = 5e-3
     network_rate: float = 5e-4
+
+    def __post_init__(self) -> None:
+        """InputError for the first option that cannot be meant."""
+        super().__post_init__()
+        check_word("color", self.color, ("neural", "sh"))
+        least, greatest = self.patch_range
+        check_range("patch_range[0]", least, 2)
+        check_range("patch_range[1]", greatest, least)
+        check_range("hash_levels", self.hash_levels, 2)
+        check_range("hash_log2_size", self.hash_log2_size, 1, 30)
 
     def recipe(self, scene: TrainingScene) -> Recipe:
         """Three optimiser steps an iteration."""

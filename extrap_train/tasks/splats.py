@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks.methods.gaussians.drawing import BACKGROUNDS, draw
+from benchmarks.methods.gaussians.drawing import draw
 from benchmarks.methods.gaussians.fit_views import fit_views
 from benchmarks.methods.gaussians.gaussians import Gaussians
-from benchmarks.methods.gaussians.options import GaussianOptions
+from benchmarks.methods.gaussians.options import BACKGROUNDS, GaussianOptions
 from benchmarks.methods.gaussians.ply import read_comments, read_splats, write_splats
 from benchmarks.methods.gaussians.rasterization import rasterizer
 from extrap_train.config import SplatsConfig

@@ -9,8 +9,6 @@ from benchmarks.methods.gaussians.gaussians import Gaussians
 from benchmarks.methods.gaussians.rasterization import Rasterization
 from extrap_train.views import Camera
 
-BACKGROUNDS = {"black": 0.0, "white": 1.0}
-
 
 @dataclass(frozen=True)
 class Drawing:

@@ -2,7 +2,13 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+
+from benchmarks.methods.gaussians.checks import check_range, check_word
+from extrap_train.errors import InputError
+
+INITS = ("triangulated", "dense", "random")
+BACKGROUNDS = {"black": 0.0, "white": 1.0}
+RASTERIZERS = ("numba", "gsplat")
 
 
 @dataclass(frozen=True)
@@ -62,5 +68,17 @@ class GaussianOptions:
     """0: opacity is never reset."""
     reset_first: int = 3000
     reset_opacity: float = 0.01
-    rasterizer: Literal["numba", "gsplat"] = "numba"
-    """On the CPU, or gsplat on a GPU."""
+    rasterizer: str = "numba"
+    """`numba` on the CPU, or `gsplat` on a GPU."""
+
+    def __post_init__(self) -> None:
+        """InputError for the first option that cannot be meant."""
+        for name in ("iterations", "full_iterations", "max_gaussians", "sh_every"):
+            check_range(name, getattr(self, name), 1)
+        check_range("init_points", self.init_points, 0)
+        check_range("sh_degree", self.sh_degree, 0, 3)
+        if not 0 < self.init_opacity < 1:
+            raise InputError(f"init_opacity={self.init_opacity}: must be between 0 and 1")
+        check_word("init", self.init, INITS)
+        check_word("background", self.background, BACKGROUNDS)
+        check_word("rasterizer", self.rasterizer, RASTERIZERS)

@@ -25,7 +25,7 @@ Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 """The signature of `rasterization` below, which is the common part of gsplat's."""
 
 
-def rasterizer(name: Backend) -> Rasterization:
+def rasterizer(name: str) -> Rasterization:
     """The drawing function of that name: `numba` on the CPU, `gsplat` on CUDA."""
     if name == "numba":
         return rasterization

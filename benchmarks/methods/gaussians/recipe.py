@@ -8,9 +8,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from benchmarks.methods.gaussians.density import GrowthStatistics, grow, prune, reset_opacity
-from benchmarks.methods.gaussians.drawing import BACKGROUNDS, Drawing, draw
+from benchmarks.methods.gaussians.drawing import Drawing, draw
 from benchmarks.methods.gaussians.optimiser import GaussianOptimiser
-from benchmarks.methods.gaussians.options import GaussianOptions
+from benchmarks.methods.gaussians.options import BACKGROUNDS, GaussianOptions
 from benchmarks.methods.gaussians.parameters import GaussianParameters
 from benchmarks.methods.gaussians.photometric import photograph, photometric_loss
 from benchmarks.methods.gaussians.points import Points, joined, pixel_points, random_points
@@ -22,7 +22,6 @@ from benchmarks.methods.gaussians.schedule import (
     Schedule,
 )
 from benchmarks.methods.gaussians.triangulate import triangulated_points
-from extrap_train.errors import InputError
 from extrap_train.views import Camera
 
 
@@ -75,15 +74,13 @@ class Recipe:
                 parts = [pixel_points(*pair) for pair in zip(views, maps, strict=True)]
                 points = joined(parts).at_most(options.init_points, self.generator)
                 self.scene.record["init"] = f"{len(points)} points of the depth source"
-            case "triangulated":
+            case _:
                 found = triangulated_points(views)
                 missing = max(options.init_points - len(found), 0)
                 points = joined([found, random_points(cameras, missing, self.generator)])
                 self.scene.record["init"] = (
                     f"{len(found)} points triangulated from the inputs, {missing} random"
                 )
-            case other:
-                raise InputError(f"init={other} is unknown; known: triangulated, dense, random")
         return points.at_most(options.max_gaussians, self.generator)
 
     def modules(self) -> Sequence[tuple[nn.Module, float, float]]:

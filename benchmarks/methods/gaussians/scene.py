@@ -8,6 +8,9 @@ from extrap_train.depth import DepthMap, DepthSource
 from extrap_train.errors import InputError
 from extrap_train.views import View
 
+_OVERSHOOT = 0.1
+"""How far interpolation may take colours out of [0, 1]."""
+
 
 @dataclass(frozen=True)
 class TrainingScene:
@@ -28,17 +31,31 @@ class TrainingScene:
 
 
 def training_scene(views: Sequence[View], depth_source: DepthSource, seed: int) -> TrainingScene:
-    """The scene of these views; InputError for fewer than two, or a pose that is not finite."""
+    """The scene of these views; InputError for fewer than two, or one that cannot be used."""
     if len(views) < 2:
         raise InputError(f"{len(views)} input view(s): Gaussians need at least two; give more")
     for index, view in enumerate(views):
-        camera = view.camera
-        finite = camera.world_to_cam.isfinite().all() and camera.intrinsics.isfinite().all()
-        if not (finite and view.image.isfinite().all()):
+        trouble = _trouble(view)
+        if trouble is not None:
             name = view.name or f"input view {index}"
-            raise InputError(
-                f"{name}: its image, pose or intrinsics are not finite; mend the input"
-            )
+            raise InputError(f"{name}: {trouble}; mend the input")
     frame = scene_frame([view.camera for view in views])
     moved = tuple(frame.view(view) for view in views)
     return TrainingScene(tuple(views), moved, frame, depth_source, seed)
+
+
+def _trouble(view: View) -> str | None:
+    """Why a posed photograph cannot be used."""
+    image, camera = view.image, view.camera
+    finite = camera.world_to_cam.isfinite().all() and camera.intrinsics.isfinite().all()
+    if not (finite and image.isfinite().all()):
+        return "its image, pose or intrinsics are not finite"
+    height, width = image.shape[-2:]
+    if (height, width) != (camera.height, camera.width):
+        return f"its image is {width}x{height}, its camera's {camera.width}x{camera.height}"
+    if not (camera.intrinsics.diagonal()[:2] > 0).all():
+        return "its focal length is not positive"
+    low, high = float(image.min()), float(image.max())
+    if low < -_OVERSHOOT or high > 1 + _OVERSHOOT:
+        return f"its colours run from {low:g} to {high:g}, and not from 0 to 1"
+    return None

@@ -88,6 +88,40 @@ def _nan_in_a_pose(inputs: SceneInputs) -> SceneInputs:
     return replace(inputs, views=(inputs.views[0], broken))
 
 
+def _spoilt(inputs: SceneInputs, **changes) -> SceneInputs:
+    view = replace(inputs.views[1], name="b.png", **changes)
+    return replace(inputs, views=(inputs.views[0], view))
+
+
+def _cut(inputs: SceneInputs) -> SceneInputs:
+    view = inputs.views[1]
+    return _spoilt(inputs, image=view.image[:, :, :12], depth=view.depth[:, :12])
+
+
+def _bytes(inputs: SceneInputs) -> SceneInputs:
+    return _spoilt(inputs, image=255 * inputs.views[1].image)
+
+
+def _no_focal(inputs: SceneInputs) -> SceneInputs:
+    camera = inputs.views[1].camera
+    intrinsics = camera.intrinsics * (1 - torch.eye(3)) + torch.diag(torch.tensor([0.0, 9, 1]))
+    return _spoilt(inputs, camera=replace(camera, intrinsics=intrinsics))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (_cut, "b.png: its image is 12x16, its camera's 16x16"),
+        (_bytes, "b.png: its colours run from .* and not from 0 to 1"),
+        (_no_focal, "b.png: its focal length is not positive"),
+    ],
+)
+def test_a_view_that_does_not_fit_its_camera_is_named(spoil, said: str) -> None:
+    inputs = spoil(scene_inputs(size=16)[0])
+    with pytest.raises(InputError, match=said):
+        training_scene(inputs.views, inputs.depth_source, seed=0)
+
+
 @each_method
 @pytest.mark.parametrize(
     ("spoil", "said"), [(_one_view, "at least two"), (_nan_in_a_pose, "b.png: .* not finite")]
@@ -125,10 +159,28 @@ def test_no_triangulated_point_and_no_random_one_is_refused() -> None:
         ThreeDgs(init_points=0).synthesize(inputs)
 
 
-def test_an_unknown_init_is_named() -> None:
-    inputs, _ = scene_inputs(size=16)
-    with pytest.raises(InputError, match="init=mvs is unknown"):
-        ThreeDgs(init="mvs").synthesize(inputs)
+@pytest.mark.parametrize(
+    ("option", "value", "said"),
+    [
+        ("init", "mvs", "init=mvs is unknown; known: triangulated"),
+        ("iterations", 0, "iterations=0: must be at least 1"),
+        ("iterations", -5, "iterations=-5: must be at least 1"),
+        ("max_gaussians", 0, "max_gaussians=0: must be at least 1"),
+        ("sh_degree", 4, "sh_degree=4: must be from 0 to 3"),
+        ("sh_degree", -1, "sh_degree=-1: must be from 0 to 3"),
+        ("init_opacity", 1.0, "init_opacity=1.0: must be between 0 and 1"),
+        ("init_opacity", math.nan, "init_opacity=nan: must be between 0 and 1"),
+        ("background", "grey", "background=grey is unknown; known: black, white"),
+        ("rasterizer", "taichi", "rasterizer=taichi is unknown; known: numba, gsplat"),
+        ("color", "rgb", "color=rgb is unknown; known: neural, sh"),
+        ("patch_range", (1, 4), r"patch_range\[0\]=1: must be at least 2"),
+        ("patch_range", (17, 5), r"patch_range\[1\]=5: must be at least 17"),
+        ("hash_log2_size", -1, "hash_log2_size=-1: must be from 1 to 30"),
+    ],
+)
+def test_an_option_that_cannot_be_meant_is_named(option: str, value, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        DnGaussian(**SMALL | {option: value})
 
 
 def test_an_optimisation_that_diverges_is_stopped_with_its_iteration() -> None:
