@@ -1,14 +1,18 @@
 """The depth that views bring along: CO3D's, or the exact depth of rendered ones."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from extrap_train.depth import DepthMap, PointMaps, point_maps_of
 from extrap_train.errors import InputError
 from extrap_train.views import View
+
+LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -25,8 +29,22 @@ class DatasetDepth:
         return DepthMap(depth, (depth > 0).to(depth.dtype))
 
     def depth_maps(self, views: Sequence[View]) -> list[DepthMap]:
-        """Every view's own depth."""
-        return [self.depth_map(view, ()) for view in views]
+        """Every view's own depth; 0, unknown, and a warning for single views without one.
+
+        InputError if none has any.
+        """
+        without = [view for view in views if view.depth is None]
+        if without and len(without) == len(views):
+            _depth(without[0])
+        if without:
+            first = without[0].name or "a view"
+            LOG.warning("no depth comes with %d views of %d: %s", len(without), len(views), first)
+        return [
+            DepthMap(*torch.zeros_like(view.image[:2]))
+            if view.depth is None
+            else self.depth_map(view, ())
+            for view in views
+        ]
 
     def point_maps(self, first: View, second: View) -> PointMaps:
         """Both views' points in the first camera's frame."""

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from captures import write_capture
+from captures import frame_entries, replace_frame_entries, write_capture
 
 from extrap_train.config import Co3dConfig, DatasetDepthConfig, FlowMatcherConfig, PrepConfig
 from extrap_train.data.store import PreparedData
@@ -95,3 +95,23 @@ def test_a_restored_and_a_replaced_photograph_are_taken_in(photographs: Path) ->
     assert (after[0] - before[0]).abs().max() > 0.1
     assert torch.equal(after[1], before[1])
     assert {file: file.stat().st_mtime_ns for file in others} == others
+
+
+def test_a_frame_whose_annotation_names_no_depth_costs_no_more_than_itself(
+    photographs: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    entries = frame_entries(photographs)
+    (entry,) = (e for e in entries if (e["sequence_name"], e["frame_number"]) == ("fine", 51))
+    entry["depth"] = None
+    replace_frame_entries(photographs, entries)
+    with caplog.at_level(logging.WARNING):
+        data = prepared(photographs)
+    name = Path(entry["image"]["path"]).name
+    assert data.manifest["sequences"] == {"kept": len(NAMES), "dropped": 0, "failed": 0}
+    assert f"no depth comes with 1 views of {FRAMES}: {name}" in caplog.text
+    # Its photograph is as good a query as any; a reference it cannot be.
+    index = list(data.names("cup/fine")).index(name)
+    pairs = [pair for split in ("train", "test") for pair in data.pairs(split)]
+    ours = [pair for pair in pairs if pair.sequence == "cup/fine"]
+    assert any(pair.query == index for pair in ours)
+    assert not any(index in pair.references for pair in ours)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from traced_scenes import SCENES, orbit_camera, render
@@ -43,3 +45,13 @@ def test_a_view_without_depth_names_the_remedy():
     view = View(torch.zeros(3, 8, 8), orbit_camera(0, 8), name="frame000001.jpg")
     with pytest.raises(InputError, match=r"frame000001\.jpg.*depth=stereo"):
         DatasetDepth().depth_map(view, [])
+    with pytest.raises(InputError, match=r"frame000001\.jpg.*depth=stereo"):
+        DatasetDepth().depth_maps([view, view])
+
+
+def test_one_view_without_depth_among_others_is_unknown():
+    known = render(SCENES["slanted plane"], orbit_camera(0, 16))
+    found = DatasetDepth().depth_maps([known, replace(known, depth=None)])
+    assert torch.equal(found[0].depth, known.depth)
+    assert not found[1].depth.any()
+    assert not found[1].confidence.any()
