@@ -1,5 +1,6 @@
 """Depth of single pictures, set right by what matches in other views say at a few points."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
@@ -19,6 +20,7 @@ from extrap_train.geometry.triangulation import triangulate
 from extrap_train.matching import Matcher
 from extrap_train.views import View, combine
 
+LOG = logging.getLogger(__name__)
 LEAST_PARALLAX_RAD = 0.02
 """About 1°: below it a match says little of depth."""
 LARGEST_ERROR = 0.003
@@ -26,8 +28,6 @@ LARGEST_ERROR = 0.003
 LEAST_POINTS = 20
 EXPLAINED = 0.05
 """Relative error of depth up to which a triangulated point agrees."""
-
-
 FARTHEST = 3.0
 """Multiple of the farthest known point beyond which the line says nothing of depth."""
 
@@ -39,6 +39,10 @@ class _Points:
     pixels: Float[Tensor, "n 2"]
     depth: Float[Tensor, "n"]
     weights: Float[Tensor, "n"]
+
+
+class NotAligned(InputError):
+    """Why one view's depth has neither scale nor shift."""
 
 
 @runtime_checkable
@@ -83,45 +87,56 @@ class MonocularDepth:
     def depth_map(self, view: View, neighbours: Sequence[View]) -> DepthMap:
         """One view's depth; the neighbours give it scale and shift.
 
-        InputError if too few points of it are found in them.
+        InputError if too few points of it are found in them, or these contradict the network.
         """
         helpers = self._neighbours([view, *neighbours])[0]
-        found = self._aligned(view, [neighbours[i - 1] for i in helpers])
-        if found is None:
-            raise InputError(
-                f"{view.name or 'a view'}: fewer than {LEAST_POINTS} of its points are found in "
-                "other views, which depth=monocular needs for scale and shift; add photographs or "
-                "choose another depth.matcher"
-            )
-        return found
+        return self._aligned(view, [neighbours[i - 1] for i in helpers])
 
     def depth_maps(self, views: Sequence[View]) -> list[DepthMap]:
-        """The depth of every view; 0, unknown, where too few points are found in the others."""
-        maps = [
-            self._aligned(view, [views[j] for j in helpers])
+        """The depth of every view; 0, unknown, where `depth_map` would raise, and a warning why."""
+        return [
+            self._aligned_or_unknown(view, [views[j] for j in helpers])
             for view, helpers in zip(views, self._neighbours(views), strict=True)
         ]
-        return [
-            DepthMap(*torch.zeros_like(view.image[:2])) if found is None else found
-            for view, found in zip(views, maps, strict=True)
-        ]
+
+    def _aligned_or_unknown(self, view: View, helpers: Sequence[View]) -> DepthMap:
+        try:
+            return self._aligned(view, helpers)
+        except NotAligned as reason:
+            LOG.warning("no depth: %s", reason)
+            return DepthMap(*torch.zeros_like(view.image[:2]))
 
     def _neighbours(self, views: Sequence[View]) -> list[list[int]]:
         cameras = [view.camera for view in views]
         center = convergence_point(cameras)
         return choose_neighbours(cameras, center, self.config.neighbours, WIDEST_RAD)
 
-    def _aligned(self, view: View, helpers: Sequence[View]) -> DepthMap | None:
-        """None where too few points are found, or nearness does not grow with the network's."""
+    def _aligned(self, view: View, helpers: Sequence[View]) -> DepthMap:
+        """NotAligned where too few points are found, or they are not nearer where it says so."""
+        name = view.name or "a view"
         parts = [self._points(view, helper) for helper in helpers]
-        if sum(len(part.depth) for part in parts) < LEAST_POINTS:
-            return None
+        count = sum(len(part.depth) for part in parts)
+        if count < LEAST_POINTS:
+            raise NotAligned(
+                f"{name}: {count} of its points are found in other views, fewer than the "
+                f"{LEAST_POINTS} that depth=monocular needs for scale and shift; add photographs "
+                "or choose another depth.matcher"
+            )
         points = combine(parts, lambda tensors: torch.cat(list(tensors)))
         predicted = self.network.inverse_depth(view.image)
         at_points = _sample(predicted, points.pixels)
         line = robust_line(at_points, 1 / points.depth, points.weights)
-        if line is None or line.slope <= 0:
-            return None
+        if line is None:
+            raise NotAligned(
+                f"{name}: the network says the same of all {count} points that are found in other "
+                "views; depth.model is unfit for this picture: try depth=stereo"
+            )
+        if line.slope <= 0:
+            raise NotAligned(
+                f"{name}: the network and the {count} points that are found in other views "
+                "contradict each other: what it takes for nearer is farther; matches or poses are "
+                "wrong, or depth.model is unfit: try another depth.matcher or depth=stereo"
+            )
         explained = (line(at_points) * points.depth - 1).abs() <= EXPLAINED
         inverse = line(predicted)
         near_enough = inverse > 1 / (FARTHEST * points.depth.max())

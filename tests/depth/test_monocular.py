@@ -1,3 +1,4 @@
+import logging
 from dataclasses import dataclass
 
 import pytest
@@ -60,13 +61,26 @@ def test_point_maps_meet_in_the_first_frame():
         assert (points - expected).norm(dim=-1).median() < 0.03
 
 
-def test_a_network_that_takes_near_for_far_is_not_believed():
+def test_a_network_that_takes_near_for_far_is_not_believed(caplog):
     source, views = source_and_views(0, 8, scale=-3.0)
-    assert not any(found.depth.any() for found in source.depth_maps(views))
+    with pytest.raises(InputError, match=r"the \d{3,} points .* contradict each other") as raised:
+        source.depth_map(views[0], views[1:])
+    assert "fewer than" not in str(raised.value)
+    with caplog.at_level(logging.WARNING):
+        assert not any(found.depth.any() for found in source.depth_maps(views))
+    assert str(raised.value) in caplog.text
+
+
+def test_a_network_that_says_nothing_is_said_to():
+    source, views = source_and_views(0, 8, scale=0.0)
+    with pytest.raises(InputError, match=r"says the same of all \d{3,} points"):
+        source.depth_map(views[0], views[1:])
 
 
 def test_too_few_points_are_said_or_unknown():
     source, views = source_and_views(0, 120)
-    with pytest.raises(InputError, match=r"fewer than 20 .* another depth\.matcher"):
+    with pytest.raises(
+        InputError, match=r"\d+ of its points .* fewer than the 20 .* another depth\.matcher"
+    ):
         source.depth_map(views[0], views[1:])
     assert not any(found.depth.any() for found in source.depth_maps(views))
