@@ -35,13 +35,13 @@ _FILES = {
 }
 
 
-def packaged_weights(name: str) -> Path:
-    """Folder of a model that comes with the package; raises InputError naming those that do."""
+def packaged_weights(name: str, option: str = "model.start") -> Path:
+    """Folder of a model that comes with the package; InputError names those that do."""
     folder = Path(__file__).parents[1] / "weights"
     if not (folder / name / _CONFIG).is_file():
         known = sorted(path.parent.name for path in folder.glob(f"*/{_CONFIG}"))
         raise InputError(
-            f"model.start={name} is neither a file or folder of weights nor one of the package's: "
+            f"{option}={name} is neither a file or folder of weights nor one of the package's: "
             f"{', '.join(known)}"
         )
     return folder / name

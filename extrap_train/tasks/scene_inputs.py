@@ -79,11 +79,9 @@ def newest_model(config: TrainConfig) -> Path:
 
 
 def open_model(weights: str, adapter: str | None = None) -> ExtrapolationModel:
-    """The model of a folder, or `base`, the packaged one, with a scene's adapter upon it if any."""
+    """The model of a folder or of the package, with a scene's adapter upon it if any."""
     folder = Path(weights)
-    if not folder.is_dir() and weights != "base":
-        raise InputError(f"weights={weights}: is neither a model folder nor `base`")
-    model = load_model(folder if folder.is_dir() else packaged_weights(weights))
+    model = load_model(folder if folder.is_dir() else packaged_weights(weights, "weights"))
     if adapter is not None:
         load_adapter(model, Path(adapter))
     return model.eval()

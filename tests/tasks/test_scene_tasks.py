@@ -120,7 +120,7 @@ def test_what_cannot_be_used_is_one_line(command, weights, tmp_path) -> None:
     assert "has 1 input view, and pairs need at least two" in _refused(command, *one)
     assert "give scene=FOLDER" in _refused(command, "task=scene", given, "scene=null")
     assert "there is no trained model of hydrant" in _refused(command, "task=scene")
-    assert "neither a model folder nor `base`" in _refused(command, "task=scene", "weights=bse")
+    assert "nor one of the package's: base" in _refused(command, "task=scene", "weights=bse")
     view = ["task=view", given]
     assert "a pose=FRAME|FILE.json or an orbit=DEGREES" in _refused(command, *view)
     assert "neither a frame of the scene nor" in _refused(command, *view, "pose=frame99")
