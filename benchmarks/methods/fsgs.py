@@ -95,19 +95,21 @@ class FsgsRecipe(Recipe):
         return pearson_depth_loss(drawing.depth, found.reliable())
 
     def grow(self, training: Training) -> None:
-        """Unpool early in the training, then grow as 3DGS does."""
-        options = self.options
+        """Grow as 3DGS does and, early in the training, unpool into the room that is left."""
         super().grow(training)
-        if training.iteration >= training.schedule.at(options.unpool_until):
-            return
-        room = options.max_gaussians - len(training.optimiser)
-        new = unpooled(
+        if training.iteration < training.schedule.at(self.options.unpool_until):
+            self._unpool(training)
+
+    def _unpool(self, training: Training) -> None:
+        options, count = self.options, len(training.optimiser)
+        new, limited = unpooled(
             training.optimiser.parameters,
             options.unpool_proximity,
             options.unpool_scale,
             options.pairing,
-            max(room, 0),
+            max(options.max_gaussians - count, 0),
         )
-        kept = torch.ones(len(training.optimiser), dtype=torch.bool)
         training.optimiser.append(new)
-        training.statistics.follow(kept, len(new))
+        training.statistics.follow(torch.ones(count, dtype=torch.bool), len(new))
+        if limited:
+            self.scene.record["unpooling"] = f"stopped at {options.max_gaussians} Gaussians"

@@ -26,5 +26,11 @@ def monocular_source(scene: TrainingScene, name: str) -> DepthSource:
 
 
 def prior_depths(scene: TrainingScene, source: DepthSource) -> list[Float[Tensor, "h w"]]:
-    """Depth of every input view up to an affine map; 0 where it is unknown."""
-    return [found.reliable() for found in source.depth_maps(scene.given)]
+    """Depth of every input view up to an affine map; 0 where it is unknown.
+
+    The record says in how many inputs there is any: in others, depth losses are silent.
+    """
+    priors = [found.reliable() for found in source.depth_maps(scene.given)]
+    known = sum(bool((prior > 0).any()) for prior in priors)
+    scene.record["monocular depth"] = f"in {known} of {len(priors)} inputs"
+    return priors

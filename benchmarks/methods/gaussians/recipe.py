@@ -1,7 +1,7 @@
 """What one method does in the training loop; this one is 3DGS, and others override parts of it."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from benchmarks.methods.gaussians.density import GrowthStatistics, grow, prune, reset_opacity
 from benchmarks.methods.gaussians.drawing import Drawing, draw
+from benchmarks.methods.gaussians.gaussians import rgb_to_sh
 from benchmarks.methods.gaussians.optimiser import GaussianOptimiser
 from benchmarks.methods.gaussians.options import BACKGROUNDS, GaussianOptions
 from benchmarks.methods.gaussians.parameters import GaussianParameters
@@ -98,6 +99,22 @@ class Recipe:
     def colors(self, parameters: GaussianParameters, camera: Camera) -> Float[Tensor, "n 3"] | None:
         """Colours in place of the spherical harmonics."""
         return None
+
+    def baked(self, parameters: GaussianParameters) -> GaussianParameters:
+        """The Gaussians with colours that spherical harmonics hold: those of `colors`, where there
+        are such, as the inputs see them on the mean.
+        """
+        cameras = [self.camera(index) for index in range(len(self.scene.views))]
+        seen = [self.colors(parameters, camera) for camera in cameras]
+        colors = [each for each in seen if each is not None]
+        if not colors:
+            return parameters
+        mean = torch.stack(colors).mean(0)
+        return replace(
+            parameters,
+            sh_dc=rgb_to_sh(mean)[:, None],
+            sh_rest=torch.zeros_like(parameters.sh_rest),
+        )
 
     def draw(
         self, parameters: GaussianParameters, camera: Camera, progress: float = 1.0

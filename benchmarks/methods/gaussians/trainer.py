@@ -58,8 +58,12 @@ class Fit:
 
     @torch.no_grad()
     def gaussians(self) -> Gaussians:
-        """The Gaussians in the world that the input views were given in."""
-        frame, drawn = self.recipe.scene.frame, self.parameters.gaussians()
+        """The Gaussians in the world that the input views were given in.
+
+        A network's colours are baked: the mean of what the inputs see, the same from everywhere.
+        """
+        frame = self.recipe.scene.frame
+        drawn = self.recipe.baked(self.parameters).gaussians()
         return Gaussians(
             frame.to_world(drawn.means), drawn.quats, drawn.scales * frame.unit,
             drawn.opacities, drawn.sh,

@@ -3,7 +3,7 @@
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from benchmarks.methods.gaussians.parameters import (
@@ -19,8 +19,9 @@ Pairing = Literal["paper", "released"]
 
 def unpooled(
     parameters: GaussianParameters, proximity: float, scale: float, pairing: Pairing, most: int
-) -> GaussianParameters:
-    """The Gaussians that fill the gaps between those already there; at most `most` of them.
+) -> tuple[GaussianParameters, bool]:
+    """The Gaussians that fill the gaps between those already there, the most isolated sources'
+    first and at most `most` of them; and whether there would have been more.
 
     A Gaussian is a source where the mean squared distance to its three neighbours exceeds
     `proximity` and its largest scale `scale`. On each edge from a source to a neighbour a new one
@@ -29,14 +30,16 @@ def unpooled(
     stand as 0 0 0 1 1 1, so that with several sources most edges lead to a stranger.
     """
     distance, index = nearest_neighbours(parameters.means, NEIGHBOURS)
-    sources = isolated(parameters, distance, proximity, scale)
+    gap = distance.square().mean(1)
+    sources = isolated(parameters, gap, proximity, scale)
     source, target = edges(sources, index, pairing)
+    limited = len(source) > most
     source, target = source[:most], target[:most]
     means = parameters.means.detach()
     count = len(source)
     quats = torch.zeros(count, 4).to(means)
     quats[:, 0] = 1
-    return from_tensors(
+    new = from_tensors(
         {
             "means": (means[source] + means[target]) / 2,
             "log_scales": parameters.log_scales.detach()[target],
@@ -46,26 +49,24 @@ def unpooled(
             "sh_rest": torch.zeros_like(parameters.sh_rest[target]),
         }
     )
+    return new, limited
 
 
 def isolated(
-    parameters: GaussianParameters,
-    distance: Float[Tensor, "n k"],
-    proximity: float,
-    scale: float,
-) -> Bool[Tensor, "n"]:
-    """Which Gaussians are large and far from their neighbours."""
-    far = distance.square().mean(1) > proximity
-    return far & (parameters.scales.detach().amax(1) > scale)
+    parameters: GaussianParameters, gap: Float[Tensor, "n"], proximity: float, scale: float
+) -> Int[Tensor, "s"]:
+    """Numbers of the Gaussians that are large and far from their neighbours, farthest first."""
+    chosen = (gap > proximity) & (parameters.scales.detach().amax(1) > scale)
+    order = gap.argsort(descending=True, stable=True)
+    return order[chosen[order]]
 
 
 def edges(
-    sources: Bool[Tensor, "n"], neighbours: Int[Tensor, "n k"], pairing: Pairing
+    sources: Int[Tensor, "s"], neighbours: Int[Tensor, "n k"], pairing: Pairing
 ) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"]]:
     """Both ends of every new edge, as Gaussian numbers."""
-    number = sources.nonzero()[:, 0]
-    targets = neighbours[number].flatten()
+    targets = neighbours[sources].flatten()
     count = neighbours.shape[1]
     if pairing == "paper":
-        return number.repeat_interleave(count), targets
-    return number.repeat(count), targets
+        return sources.repeat_interleave(count), targets
+    return sources.repeat(count), targets

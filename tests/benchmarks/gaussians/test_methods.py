@@ -212,6 +212,27 @@ def test_growth_adds_gaussians_where_it_may() -> None:
     assert eager.synthesize(inputs).counts["gaussians"] > 250
 
 
+@pytest.mark.parametrize("name", ["fsgs", "dngaussian"])
+def test_the_record_says_in_how_many_inputs_there_was_depth(name: str) -> None:
+    inputs, _ = scene_inputs(size=16)
+    blind = replace(inputs.views[0], depth=torch.zeros(16, 16))
+    some = replace(inputs, views=(blind, *inputs.views[1:]))
+    method = replace(METHODS[name], iterations=1)
+    assert method.fitted(some).record["monocular depth"] == "in 2 of 3 inputs"
+
+
+def test_a_networks_colours_are_baked_for_whoever_takes_the_gaussians_away() -> None:
+    """As the inputs see them on the mean: untrained harmonics would be noise."""
+    inputs, _ = scene_inputs(size=24)
+    fitted = METHODS["dngaussian"].fitted(inputs)
+    cameras = [view.camera for view in fitted.recipe.scene.views]
+    seen = [fitted.recipe.colors(fitted.parameters, camera) for camera in cameras]
+    taken = fitted.gaussians().sh
+    expected = sum(each.detach() for each in seen) / len(seen)
+    torch.testing.assert_close(0.5 + taken[:, 0] / (2 * math.sqrt(math.pi)), expected)
+    assert not taken[:, 1:].any()
+
+
 def test_dngaussian_takes_soft_steps_from_a_sixth_of_the_training_on() -> None:
     inputs, _ = scene_inputs(size=16)
     method = replace(METHODS["dngaussian"], iterations=12)
