@@ -18,6 +18,7 @@ from data_prep.report_pairs import (
     share_corrected,
     without_numbers,
 )
+from data_prep.split import held_out
 from extrap_train.data.files import write_whole
 from extrap_train.data.store import Pairs, PreparedData
 from extrap_train.geometry.viewpoints import fit_orbit
@@ -90,7 +91,9 @@ def summary(data: PreparedData) -> dict[str, str]:
         facts[f"{split} pairs"] = str(len(pairs))
         if len(pairs):
             low, middle, high = np.degrees(np.quantile(pairs.angle_rad, (0.05, 0.5, 0.95)))
-            facts[f"{split} angles"] = f"{low:.0f}° to {high:.0f}°, median {middle:.0f}°"
+            facts[f"{split} angles"] = (
+                f"median {middle:.0f}°, 5 % and 95 % quantiles {low:.0f}° and {high:.0f}°"
+            )
     if data.is_corrected:
         facts["warps corrected"] = share_corrected(data)
     facts["split"] = f"sha256 {data.manifest['split'][:16]}…"
@@ -120,12 +123,15 @@ def coverage(data: PreparedData) -> Figure:
     shown = kept.iloc[_evenly(len(kept), 24)]
     figure = Figure(figsize=(5, 5), layout="constrained")
     axes = figure.add_subplot(projection="polar")
-    for ring, (name, split) in enumerate(zip(shown["sequence"], shown["split"], strict=True)):
+    for ring, (name, role) in enumerate(zip(shown["sequence"], shown["split"], strict=True)):
         azimuths = fit_orbit(data.cameras(name)).azimuths_rad
-        colour = _COLOURS["test" if split == "test" else "train"]
-        axes.plot(azimuths, np.full(len(azimuths), ring + 8), ".", color=colour, markersize=4)
+        tested = held_out(len(azimuths)) if role == "train and test" else role == "test"
+        tested = np.broadcast_to(tested, azimuths.shape)
+        for split, own in (("train", ~tested), ("test", tested)):
+            rings, colour = np.full(own.sum(), ring + 8), _COLOURS[split]
+            axes.plot(azimuths[own], rings, ".", color=colour, markersize=4)
     axes.set(yticks=[], ylim=(0, len(shown) + 8))
-    axes.set_title(f"azimuths of {len(shown)} sequences (orange: test)")
+    axes.set_title("azimuths of the frames, a ring a sequence (orange: test)")
     return figure
 
 

@@ -29,7 +29,7 @@ def correction_report(data: PreparedData, folder: Path) -> dict[str, Any]:
     worst = [int(index) for index in order[:WORST]]
     write_whole(folder / "correction.png", as_png(error_histogram(pairs)))
     pair_sheet(data, worst, folder / "worst.png")
-    return {"corrections": correction_facts(data), "worst": [_row(pairs, i) for i in worst]}
+    return {"corrections": correction_facts(data), "worst": [_row(data, pairs, i) for i in worst]}
 
 
 def share_corrected(data: PreparedData) -> str:
@@ -46,7 +46,9 @@ def correction_facts(data: PreparedData) -> dict[str, str]:
     if moved.any():
         gain = 1 - pairs.error_after[moved] / pairs.error_before[moved]
         low, middle, high = np.quantile(gain, (0.05, 0.5, 0.95))
-        facts["photometric error taken away"] = f"median {middle:.0%} ({low:.0%} to {high:.0%})"
+        facts["photometric error taken away"] = (
+            f"median {middle:.1%}, 5 % and 95 % quantiles {low:.1%} and {high:.1%}"
+        )
     reasons = Counter(without_numbers(reason) for reason in pairs.uncorrected[~moved])
     for reason, count in reasons.most_common(6):
         facts[f"left alone: {count}"] = reason
@@ -59,14 +61,16 @@ def without_numbers(reason: str) -> str:
 
 
 def error_histogram(pairs: Pairs) -> Figure:
-    """Photometric errors of the training warps, before and after."""
+    """Photometric errors of the training warps, before and after; what does not fit is counted."""
     figure = Figure(figsize=(9, 3.2), layout="constrained")
     axes = figure.subplots()
     known = np.isfinite(pairs.error_before)
     top = float(np.quantile(pairs.error_before[known], 0.99)) if known.any() else 1.0
     bins = np.linspace(0, max(top, 1e-6), 41)
     for name, errors in (("before", pairs.error_before), ("after", pairs.error_after)):
-        axes.hist(errors[known], bins.tolist(), alpha=0.6, label=name)
+        beyond = int((errors[known] > bins[-1]).sum())
+        label = f"{name} ({beyond} beyond {bins[-1]:.3g})" if beyond else name
+        axes.hist(errors[known], bins.tolist(), alpha=0.6, label=label)
     axes.set(xlabel="mean colour difference between warp and truth", ylabel="pairs")
     axes.legend()
     return figure
@@ -119,11 +123,12 @@ def _batch(data: PreparedData, chosen: list[int]) -> PairBatch:
     )
 
 
-def _row(pairs: Pairs, index: int) -> dict[str, Any]:
+def _row(data: PreparedData, pairs: Pairs, index: int) -> dict[str, Any]:
+    names = data.names(pairs.sequence[index])
     return {
         "sequence": pairs.sequence[index],
-        "reference": int(pairs.reference[index]),
-        "query": int(pairs.query[index]),
+        "reference": names[int(pairs.reference[index])],
+        "query": names[int(pairs.query[index])],
         "angle": f"{np.degrees(pairs.angle_rad[index]):.0f}°",
         "before": f"{pairs.error_before[index]:.4f}",
         "after": f"{pairs.error_after[index]:.4f}",

@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 
 import numpy as np
@@ -7,9 +8,10 @@ from PIL import Image
 from rich.console import Console
 
 from data_prep.build import prepare
-from data_prep.report import write_report
+from data_prep.report import coverage, write_report
+from data_prep.report_pairs import error_histogram
 from extrap_train.config import FlowMatcherConfig, PrepConfig
-from extrap_train.data.store import PreparedData
+from extrap_train.data.store import Pairs, PreparedData
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.matching.flow import FlowMatcher
 
@@ -57,6 +59,40 @@ def test_a_lone_sequence_without_test_pairs_has_a_report_too(tmp_path: Path) -> 
     assert "<th>test pairs</th><td>0</td>" in write_report(data, Console(quiet=True)).read_text()
 
 
+def test_held_out_frames_of_a_lone_sequence_are_drawn_as_test(tmp_path: Path) -> None:
+    options = PrepConfig(image_size=16)
+    data = prepare(
+        [capture(ring(even(24)))],
+        DatasetDepth(),
+        options,
+        test_names=1,
+        folder=tmp_path / "cup",
+        progress=False,
+    )
+    (axes,) = coverage(data).axes
+    count = {str(line.get_color()): np.size(line.get_xdata()) for line in axes.lines}
+    assert count == {"tab:blue": 20, "tab:orange": 4}
+
+
+def test_the_histogram_of_errors_counts_what_it_cuts_off() -> None:
+    errors = np.append(np.linspace(0.01, 0.02, 199), 0.5).astype(np.float32)
+    none = np.zeros(200, np.int32)
+    pairs = Pairs(
+        sequence=np.full(200, "cup/0"),
+        reference=none,
+        query=none,
+        angle_rad=errors,
+        score=errors,
+        flow=none,
+        error_before=errors,
+        error_after=errors / 4,
+        uncorrected=np.full(200, ""),
+    )
+    (axes,) = error_histogram(pairs).axes
+    _, labels = axes.get_legend_handles_labels()
+    assert labels == ["before (2 beyond 0.02)", "after (1 beyond 0.02)"]
+
+
 def test_corrections_and_the_worst_pairs_are_shown(tmp_path: Path) -> None:
     data = prepare(
         [textured_capture(str(i)) for i in range(2)],
@@ -74,6 +110,9 @@ def test_corrections_and_the_worst_pairs_are_shown(tmp_path: Path) -> None:
     worst = np.nanmax(pairs.error_after)
     assert f'<td class="number">{worst:.4f}</td>' in text
     assert (pairs.flow >= 0).any()
-    assert "photometric error taken away" in text
+    assert re.search(
+        r"taken away</th><td>median [\d.]+%, 5 % and 95 % quantiles [\d.]+% and [\d.]+%</td>", text
+    )
+    assert re.search(r"<td>cup/\d</td><td>frame\d+ → frame\d+</td>", text)
     for name in ("worst", "correction"):
         assert np.asarray(Image.open(page.with_name(f"{name}.png"))).std() > 5
