@@ -3,6 +3,7 @@
 import csv
 import os
 import statistics
+import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -33,13 +34,23 @@ def compare(
     reference: Callable[[], Float[Tensor, "..."]],
     repeats: int = 15,
 ) -> Row:
-    """Run both in turn, so that whatever else the machine does hits both; one round to warm up."""
+    """Run both in turn, so that whatever else the machine does hits both; one round to warm up.
+
+    Says on standard error what came out: the next row may take minutes.
+    """
     difference = float((ours() - reference()).abs().max())
     pairs = [
         (_milliseconds(ours, device), _milliseconds(reference, device)) for _ in range(repeats)
     ]
     ours_ms, reference_ms = (statistics.median(side) for side in zip(*pairs, strict=True))
-    return Row(case, device.type, ours_ms, reference_ms, reference_ms / ours_ms, difference)
+    row = Row(case, device.type, ours_ms, reference_ms, reference_ms / ours_ms, difference)
+    print(
+        f"{case}, {row.device}: {ours_ms:.4g} ms, reference {reference_ms:.4g} ms, "
+        f"{row.ratio:.3g} times",
+        file=sys.stderr,
+        flush=True,
+    )
+    return row
 
 
 def write_rows(rows: Sequence[Row], path: Path) -> None:

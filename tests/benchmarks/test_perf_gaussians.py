@@ -6,6 +6,7 @@ import torch
 from benchmarks.methods.gaussians.rasterization import rasterizer
 from benchmarks.perf.gaussians import cube_of_gaussians
 from benchmarks.perf.gaussians_reference import rasterize_reference
+from benchmarks.perf.timing import compare
 from benchmarks.perf.warp import orbit_camera
 from extrap_train.errors import InputError
 
@@ -45,3 +46,15 @@ def test_gsplat_is_equal():
         results.append([drawn, *torch.autograd.grad(drawn.square().sum(), inputs)])
     for a, b in zip(*results, strict=True):
         assert (a - b).abs().max() < 1e-3 * b.abs().max()
+
+
+def test_each_row_is_told_as_it_is_measured(capsys: pytest.CaptureFixture[str]):
+    seen: list[str] = []
+
+    def other() -> torch.Tensor:
+        seen.append(capsys.readouterr().err)
+        return torch.ones(2)
+
+    compare("first", torch.device("cpu"), lambda: torch.ones(2), other, repeats=1)
+    compare("second", torch.device("cpu"), lambda: torch.ones(2), other, repeats=1)
+    assert any(line.startswith("first, cpu: ") and "reference" in line for line in seen)

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -275,3 +276,12 @@ def test_a_capture_with_depth_becomes_gaussians_that_a_ply_holds(tmp_path) -> No
     torch.testing.assert_close(
         read_splats(tmp_path / "splats.ply").means, fitted.gaussians().means, atol=1e-5, rtol=1e-5
     )
+
+
+@pytest.mark.slow
+def test_the_pages_example_runs_as_it_stands(tmp_path, monkeypatch) -> None:
+    page = (Path(__file__).parents[3] / "docs" / "gaussians.md").read_text(encoding="utf-8")
+    example = page.split("```python\n")[1].split("```")[0]
+    monkeypatch.chdir(tmp_path)
+    exec(compile(example, "docs/gaussians.md", "exec"), {})
+    assert len(read_splats(tmp_path / "hydrant.ply")) > 100
