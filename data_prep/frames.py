@@ -84,8 +84,17 @@ def make_frames(
         masks=np.stack([to_eight_bits(_mask(view)) for view in views]),
     )
     if not frames.depths.any():
-        raise InputError(f"{where}: no depth is known in any of its frames; use depth=stereo")
+        raise InputError(
+            f"{where}: no depth is known in any of its frames; {_remedy(depth_source)}"
+        )
     return frames
+
+
+def _remedy(source: DepthSource) -> str:
+    """For a sequence without any depth: only depth that comes with the data can be estimated."""
+    if source.image_size is None:
+        return "use depth=stereo"
+    return "are its photographs blank, or its poses wrong? Mend or remove it"
 
 
 def _usable_views(sequence: Sequence, where: str, size: int) -> list[View]:

@@ -2,15 +2,38 @@
 
 import logging
 import shutil
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 import torch
 from captures import frame_entries, replace_frame_entries, write_capture
+from orbits import capture, even, ring
 
+from data_prep.frames import make_frames
 from extrap_train.config import Co3dConfig, DatasetDepthConfig, FlowMatcherConfig, PrepConfig
 from extrap_train.data.store import PreparedData
+from extrap_train.depth import DepthMap
+from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.errors import InputError
 from extrap_train.tasks.prepare import prepare_category
+from extrap_train.views import View
+
+
+@dataclass(frozen=True)
+class Blind(DatasetDepth):
+    """Finds no depth anywhere, as stereo does in black photographs."""
+
+    size: int | None
+
+    @property
+    def image_size(self) -> int | None:  # type: ignore[override]
+        return self.size
+
+    def depth_maps(self, views: ListOf[View]) -> list[DepthMap]:
+        return [DepthMap(*torch.zeros_like(view.image[:2])) for view in views]
+
 
 NAMES = ("fine", "no_depth", "one_corrupt", "two_corrupt", "also_fine")
 FRAMES = 12
@@ -115,3 +138,16 @@ def test_a_frame_whose_annotation_names_no_depth_costs_no_more_than_itself(
     ours = [pair for pair in pairs if pair.sequence == "cup/fine"]
     assert any(pair.query == index for pair in ours)
     assert not any(index in pair.references for pair in ours)
+
+
+@pytest.mark.parametrize(
+    ("size", "advice"), [(None, "use depth=stereo"), (32, "are its photographs blank")]
+)
+def test_a_sequence_without_depth_is_not_sent_where_it_comes_from(
+    size: int | None, advice: str
+) -> None:
+    """Black photographs have no depth under depth=stereo either, whose advice cannot be itself."""
+    source = Blind(size)
+    sequence = capture(ring(even(12)), "black")
+    with pytest.raises(InputError, match=f"no depth is known in any of its frames; {advice}"):
+        make_frames(sequence, source, 16, lone=False)
