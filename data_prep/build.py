@@ -5,10 +5,11 @@ import json
 import logging
 import shutil
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from collections.abc import Sequence as ListOf
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
@@ -85,6 +86,7 @@ def prepare(
     launcher: Launcher = HERE,
     progress: bool = True,
     retry: bool = True,
+    source: Mapping[str, Any] | None = None,
 ) -> PreparedData:
     """Make pair data from sequences, or open what an equal earlier call has made.
 
@@ -92,8 +94,9 @@ def prepare(
     options may share; the same as `folder` by default. Training warps are corrected where there is
     a `matcher`. Options of both are made to tools where the jobs run; ready tools go along with the
     jobs. A sequence that cannot be used is dropped with its reason, and tried again by the next
-    call unless `retry` is False. Finished sequences are kept whatever ends the call. Raises
-    InputError where no sequence is left, or the disk is full.
+    call unless `retry` is False. Finished sequences are kept whatever ends the call. The manifest
+    repeats `source`, what the captures came from. Raises InputError where no sequence is left, or
+    the disk is full.
     """
     shop = Workshop(Tools(depth, matcher), options, frames or folder, pairs or folder)
     plan = _Plan.of(sequences, shop, test_names)
@@ -106,7 +109,7 @@ def prepare(
         outcomes, split = _make_all(plan, launcher, progress)
         for place in (folder, *shop.frames.glob("*/*"), *shop.pairs.glob("*/*")):
             remove_partial(place)
-        write_results(folder, shop, outcomes, split, plan.keys)
+        write_results(folder, shop, outcomes, split, {**plan.keys, "data": source})
     except OSError as error:
         if error.errno not in NO_SPACE:
             raise
@@ -197,8 +200,8 @@ def _make_all(plan: _Plan, launcher: Launcher, progress: bool) -> tuple[list[Out
 def _nothing_left(outcomes: list[Outcome]) -> str:
     if not outcomes:
         return "no sequence to prepare; check the category and the data set's root"
-    reasons = Counter(outcome.verdict.reason for outcome in outcomes).most_common(3)
-    listed = "; ".join(f"{count} times {reason}" for reason, count in reasons)
+    reasons = Counter(o.verdict.reason.removeprefix(f"sequence {o.name}: ") for o in outcomes)
+    listed = "; ".join(f"{count} times {reason}" for reason, count in reasons.most_common(3))
     return (
         f"none of the {len(outcomes)} sequences of {outcomes[0].sequence.category} can be used: "
         f"{listed}. Loosen prep.* (prep.full_circle=ignore keeps partial turns) or add sequences"

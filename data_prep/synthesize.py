@@ -1,7 +1,6 @@
 """Synthetic categories on disk, in the layout of CO3D's second release."""
 
 import json
-import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ from tqdm import tqdm
 from extrap_train.config import SyntheticConfig
 from extrap_train.data.co3d import FRAME_ANNOTATIONS
 from extrap_train.data.co3d_writer import write_annotations, write_frame, write_sequence
-from extrap_train.data.files import write_whole
+from extrap_train.data.files import partial_beside, put_in_place, remove_partial, write_whole
 from extrap_train.data.synthetic import (
     build_scene,
     handheld_orbit,
@@ -72,6 +71,7 @@ def synthesize(config: SyntheticConfig, category: str, root: Path, launcher: Lau
     missing = [job for job, state in zip(jobs, states, strict=True) if state != "ready"]
     _announce(category, root, states)
     _render_all(missing, launcher)
+    remove_partial(root / category)
     records = [_read_record(job.folder) for job in jobs]
     _annotate(root, category, [record for record in records if record], config.test_sequences)
 
@@ -111,11 +111,11 @@ def _render_all(jobs: list[_Job], launcher: Launcher) -> None:
 
 def _render_sequence(job: _Job) -> None:
     """Render into a folder beside the final one, then rename it."""
-    root, options = job.root, job.options
+    options = job.options
     scene = build_scene(job.category, job.index, options["seed"])
     seed = walk_seed(job.category, job.index, options["seed"])
     cameras = handheld_orbit(scene, options["frames"], options["image_size"], seed)
-    workshop = root / job.category / f".{job.name}.{os.getpid()}"
+    workshop = partial_beside(job.folder)
     try:
         frames = [
             write_frame(workshop, job.category, job.name, number, render(scene, cameras[number]))
@@ -132,9 +132,7 @@ def _render_sequence(job: _Job) -> None:
         made = workshop / job.category / job.name
         record = {"options": options, "frames": frames, "sequence": sequence}
         write_whole(made / RECORD, json.dumps(record).encode())
-        if job.folder.exists():
-            shutil.rmtree(job.folder)
-        made.rename(job.folder)
+        put_in_place(made, job.folder, lambda _: _state(job) == "ready")
     finally:
         shutil.rmtree(workshop, ignore_errors=True)
 

@@ -3,10 +3,9 @@
 import json
 import os
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,10 @@ from extrap_train.data.frame_files import read_camera_table
 from extrap_train.data.sequences import Sequence
 from extrap_train.data.store import FORMAT
 from extrap_train.errors import InputError
+from extrap_train.runs import package_version
 
+_PACKAGES = ("extrap-train", "numpy", "opencv-python-headless", "pyarrow", "torch")
+"""Whose versions may show in what is stored."""
 _ROWS_AT_A_TIME = 50_000
 """Rows that are gathered before they are written: memory does not grow with the sequences."""
 
@@ -46,9 +48,12 @@ class Outcome:
 
 
 def write_results(
-    folder: Path, shop: Workshop, outcomes: list[Outcome], split: Split, keys: dict[str, str]
+    folder: Path, shop: Workshop, outcomes: list[Outcome], split: Split, facts: Mapping[str, Any]
 ) -> None:
-    """All tables, then the manifest, whose presence says that they are complete."""
+    """All tables, then the manifest, whose presence says that they are complete.
+
+    It repeats `facts` about what they were made from.
+    """
     units = [
         Unit(shop, outcome.sequence, split.role(outcome.name), outcome.capture_key)
         for outcome in outcomes
@@ -70,7 +75,8 @@ def write_results(
     failed = sum(outcome.failed for outcome in outcomes)
     manifest = {
         "format": FORMAT,
-        **keys,
+        **facts,
+        "depth": repr(shop.tools.depth),
         "options": asdict(shop.options),
         "correction": None if shop.tools.correction is None else repr(shop.tools.correction),
         "frames": os.path.relpath(shop.frames, folder),
@@ -82,7 +88,7 @@ def write_results(
             "failed": failed,
         },
         "pairs": dict(sorted(parts.items())),
-        "versions": {name: version(name) for name in ("numpy", "torch", "pyarrow")},
+        "versions": {name: package_version(name) for name in _PACKAGES},
     }
     write_whole(folder / "manifest.json", (json.dumps(manifest, indent=1) + "\n").encode())
 

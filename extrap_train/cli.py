@@ -26,6 +26,8 @@ from extrap_train.tasks import TASKS
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS)
 """What a full or closed disk says, wherever it is written to."""
+_NO_FOLDER = (errno.ENOTDIR, errno.ENOENT, errno.EEXIST)
+"""What is said below an output that can be no folder."""
 
 _GROUPS: dict[str, list[type]] = {
     "category": [schema.CategoryConfig],
@@ -78,9 +80,10 @@ def command(name: str, run: Callable[[Any], Path | None]) -> None:
                 raise  # the other jobs of a sweep still run
             sys.exit(f"error: {error}")  # before Hydra adds a line of its own
         except OSError as error:
-            if error.errno not in _NO_ROOM or HydraConfig.get().mode == RunMode.MULTIRUN:
+            output = getattr(typed, "output", ".")
+            if not _is_of_output(error, output) or HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise
-            where = error.filename or getattr(typed, "output", ".")
+            where = error.filename or output
             sys.exit(f"error: {where}: {error.strerror}; free space or choose another output=")
 
     try:
@@ -93,6 +96,15 @@ def command(name: str, run: Callable[[Any], Path | None]) -> None:
         sys.exit(f"error: {_one_line(error, _overrides(sys.argv[1:]))}")
     except KeyboardInterrupt:
         sys.exit("interrupted: run the same command again to resume")
+
+
+def _is_of_output(error: OSError, output: str) -> bool:
+    """Whether it says that nothing can be written where it should be."""
+    if error.errno in _NO_ROOM:
+        return True
+    place = Path(str(error.filename)).absolute()
+    is_below = place.is_relative_to(Path(output).absolute())
+    return error.errno in _NO_FOLDER and is_below and not Path(output).is_dir()
 
 
 def typed_config(config: DictConfig) -> Any:

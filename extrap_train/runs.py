@@ -176,11 +176,12 @@ def provenance(config: TrainConfig, data_hashes: dict[str, str]) -> dict[str, An
         "device": torch.cuda.get_device_name() if torch.cuda.is_available() else platform.machine(),
         "threads": torch.get_num_threads(),
         "python": platform.python_version(),
-        "versions": {name: _version(name) for name in _PACKAGES},
+        "versions": {name: package_version(name) for name in _PACKAGES},
     }
 
 
-def _version(name: str) -> str | None:
+def package_version(name: str) -> str | None:
+    """Of an installed package; None where it is not installed."""
     try:
         return version(name)
     except PackageNotFoundError:

@@ -46,6 +46,8 @@ class WeightFile:
         (`module.Type`) become `Inert`. Raises InputError where the file is absent, damaged, or
         holds anything else.
         """
+        if self.path.is_dir():
+            raise self.refusal("is a folder")
         if not self.path.is_file():
             raise self.refusal("there is no such file")
         try:

@@ -6,12 +6,15 @@ import errno
 import gzip
 import json
 import os
+import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from data_prep.__main__ import main as prepare
 from extrap_train.__main__ import main
 
 
@@ -85,6 +88,21 @@ def test_a_full_disk_anywhere_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_p
 
     monkeypatch.setattr("extrap_train.__main__.task", lambda name: full)
     assert "out: No space left on device" in _error(["category=hydrant"], monkeypatch, tmp_path)
+
+
+@pytest.mark.parametrize("place", ["file", "/proc/nowhere"])
+@pytest.mark.parametrize("start", [main, prepare])
+def test_an_output_that_can_be_no_folder_is_one_line(
+    place: str, start: Callable[[], None], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("not a folder")
+    output = tmp_path / place
+    options = ["category=hydrant", "data.train_sequences=1", f"output={output}"]
+    monkeypatch.setattr(sys, "argv", ["command", *options])
+    with pytest.raises(SystemExit) as stopped:
+        start()
+    message = str(stopped.value)
+    assert re.fullmatch(rf"error: {output}.*choose another (output=|folder)", message), message
 
 
 def test_annotations_that_climb_out_are_refused(

@@ -122,3 +122,8 @@ def test_no_table_of_tensors(tmp_path):
 def test_another_network(tmp_path, other, said):
     torch.save({"model": other.state_dict()}, tmp_path / "net.pth")
     refused(weight_file(tmp_path / "net.pth"), said)
+
+
+def test_a_folder_is_called_one(tmp_path):
+    with pytest.raises(InputError, match=r"is a folder; give option=FILE, some weights"):
+        WeightFile(tmp_path, "option", "some weights").read()

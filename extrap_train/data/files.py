@@ -100,28 +100,33 @@ def write_whole(path: Path, content: bytes) -> None:
 
 @contextmanager
 def whole_folder(folder: Path, is_wanted: Callable[[Path], bool]) -> Iterator[Path]:
-    """A folder to write into, which becomes `folder` at the end, or leaves nothing behind.
-
-    What lay there is replaced, unless it is what is wanted: then another writer has come first, and
-    its folder stays, so that nobody who reads it by now is disturbed.
-    """
+    """A folder to write into, which `put_in_place` at the end, or of which nothing stays behind."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     own = partial_beside(folder)
     made = Path(tempfile.mkdtemp(prefix=f"{own.stem}.", suffix=own.suffix, dir=folder.parent))
     try:
         yield made
         made.chmod(0o755)  # mkdtemp's folders are closed to everyone else
-        for path in (*made.rglob("*"), made):
-            _sync(path)
-        with FileLock(folder.parent / ".lock"):
-            if is_wanted(folder):
-                return
-            if folder.exists():
-                shutil.rmtree(folder)
-            made.rename(folder)
-            _sync(folder.parent)
+        put_in_place(made, folder, is_wanted)
     finally:
         shutil.rmtree(made, ignore_errors=True)
+
+
+def put_in_place(made: Path, folder: Path, is_wanted: Callable[[Path], bool]) -> None:
+    """Let what was `made` become `folder`, on the same file system, once it is on the disk.
+
+    What lay there is replaced, unless it is what is wanted: then another writer has come first, and
+    its folder stays, so that nobody who reads it by now is disturbed.
+    """
+    for path in (*made.rglob("*"), made):
+        _sync(path)
+    with FileLock(folder.parent / ".lock"):
+        if is_wanted(folder):
+            return
+        if folder.exists():
+            shutil.rmtree(folder)
+        made.rename(folder)
+        _sync(folder.parent)
 
 
 def remove_partial(folder: Path) -> None:

@@ -42,14 +42,25 @@ class SubmittedLauncher:
         died: dict[int, str],
     ) -> Iterator[tuple[int, Result]]:
         """One array task a share; the items of a task that ended without a result go to `died`."""
-        from submitit.core.utils import UncompletedJobError
+        from submitit.core.utils import (
+            FailedJobError,
+            FailedSubmissionError,
+            UncompletedJobError,
+        )
         from submitit.helpers import as_completed
 
         shares = [share for share in shares if share]
         if not shares:
             return
         parts = [[items[index] for index in share] for share in shares]
-        submitted = self.executor.map_array(_run_share, [job] * len(parts), parts)
+        try:
+            submitted = self.executor.map_array(_run_share, [job] * len(parts), parts)
+        except (FailedJobError, FailedSubmissionError) as error:
+            said = " ".join(str(error).split()) or "it said nothing"
+            raise InputError(
+                f"launcher=slurm: the cluster takes no jobs ({said}); check launcher.partition and "
+                "launcher.account, or leave launcher=local"
+            ) from None
         share_of = {task.job_id: share for task, share in zip(submitted, shares, strict=True)}
         try:
             for task in as_completed(submitted, poll_frequency=self.poll_seconds):

@@ -79,6 +79,7 @@ def prepare_category(
             matcher=how,
             launcher=opened,
             retry=retry,
+            source=asdict(data),
         )
 
 

@@ -2,6 +2,7 @@ import json
 import pickle
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -29,7 +30,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     sequences = [capture(ring(even(24)), name, depth=2.5) for name in ("a", "b", "c", "d")]
     target = tmp_path_factory.mktemp("store") / "cup"
     options = PrepConfig(image_size=SIZE)
-    prepare(sequences, DatasetDepth(), options, test_names={"c"}, folder=target, progress=False)
+    prepare(
+        sequences,
+        DatasetDepth(),
+        options,
+        test_names={"c"},
+        folder=target,
+        progress=False,
+        source={"root": "a disk", "seed": 3},
+    )
     return target
 
 
@@ -162,4 +171,7 @@ def test_an_unfinished_preparation_says_so(tmp_path: Path) -> None:
 def test_the_manifest_states_what_it_was_made_from(folder: Path) -> None:
     manifest = json.loads((folder / "manifest.json").read_text())
     assert manifest["options"]["image_size"] == SIZE
+    assert manifest["depth"] == "DatasetDepth()"
+    assert manifest["data"] == {"root": "a disk", "seed": 3}
+    assert manifest["versions"]["opencv-python-headless"].startswith(cv2.__version__)
     assert manifest["sequences"] == {"kept": 4, "dropped": 0, "failed": 0}

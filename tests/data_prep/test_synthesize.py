@@ -1,5 +1,6 @@
 """Synthetic sequences on disk."""
 
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from data_prep.gallery import gallery
 from data_prep.synthesize import synthesize
 from extrap_train.config import SyntheticConfig
 from extrap_train.data.co3d import read_category
+from extrap_train.data.files import partial_beside
 from extrap_train.data.synthetic import build_scene, handheld_orbit, render, walk_seed
 from extrap_train.errors import InputError
 from extrap_train.jobs.local import LocalLauncher
@@ -72,6 +74,15 @@ def test_what_a_killed_run_left_behind_is_made_anew(root, made):
     (root / "apple" / "0002" / "synthetic.json").unlink()
     synthesize(SMALL, "apple", root, LocalLauncher(1))
     assert contents(root) == contents(made)
+
+
+def test_half_of_a_rendering_is_removed_but_not_a_living_ones(root):
+    half = partial_beside(root / "apple" / "0000")
+    (half / "apple" / "0000").mkdir(parents=True)
+    living = half.with_name(half.name.replace(f"-{os.getpid()}.", f"-{os.getppid()}."))
+    living.mkdir()
+    synthesize(SMALL, "apple", root, LocalLauncher(1))
+    assert [path.name for path in (root / "apple").glob(".*.tmp")] == [living.name]
 
 
 def test_more_training_sequences_keep_the_test_sequences(root):

@@ -117,6 +117,20 @@ def _is_alive(pid: int) -> bool:
         return False
 
 
+def test_a_cluster_that_takes_no_jobs_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refusing = tmp_path / "sbatch"
+    refusing.write_text("#!/bin/sh\necho 'sbatch: error:\ninvalid partition' >&2\nexit 1\n")
+    refusing.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setattr("shutil.which", lambda name: str(refusing))
+    launcher = slurm_launcher(SlurmConfig(), tmp_path / "slurm")
+    with pytest.raises(InputError, match=r"takes no jobs \(.*invalid partition.*\); check") as said:
+        list(launcher.run(square, [1, 2]))
+    assert "\n" not in str(said.value)
+
+
 def test_a_machine_without_slurm_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
