@@ -112,3 +112,14 @@ def test_two_processes_with_a_network_need_few_open_files(tmp_path: Path) -> Non
     (folder,) = (tmp_path / "outputs" / "data").glob("cup-*")
     assert len(LoFTR(pretrained=None).state_dict()) * 2 > FEW, "or two waiting jobs would fit"
     assert PreparedData.open(folder).manifest["sequences"]["kept"] == 5
+
+
+def test_other_weights_under_the_same_name_are_other_tools(tmp_path: Path) -> None:
+    weights, options = tmp_path / "loftr.ckpt", LoftrMatcherConfig()
+    options.checkpoint = str(weights)
+    absent = Tools(DatasetDepth(), options).correction_identity
+    weights.write_bytes(b"some")
+    first = Tools(DatasetDepth(), options).correction_identity
+    weights.write_bytes(b"others")
+    assert len({absent, first, Tools(DatasetDepth(), options).correction_identity}) == 3
+    assert Tools(DatasetDepth(), None).correction_identity == ""
