@@ -178,6 +178,7 @@ def _make_all(plan: _Plan, launcher: Launcher, progress: bool) -> tuple[list[Out
                 outcomes[number].sequence,
                 roles[name],
                 outcomes[number].capture_key,
+                progress=progress and len(kept) == 1,
             )
             for name, number in kept.items()
             if made.get(name) != roles[name]

@@ -11,6 +11,7 @@ import pandas as pd
 import pyarrow as pa
 import torch
 from jaxtyping import Bool, Float
+from tqdm import tqdm
 
 from data_prep.correct import correct_pair
 from data_prep.select import select_pairs
@@ -101,7 +102,11 @@ def choose_pairs(frames: StoredFrames, name: str, role: str, options: PrepConfig
 
 
 def correct_pairs(
-    frames: StoredFrames, pairs: pd.DataFrame, matcher: Matcher | None, grid: int
+    frames: StoredFrames,
+    pairs: pd.DataFrame,
+    matcher: Matcher | None,
+    grid: int,
+    progress: bool = False,
 ) -> tuple[pd.DataFrame, Float[np.ndarray, "m 2 g g"]]:
     """The pairs with what correction did for each, and the flows that `flow` numbers.
 
@@ -110,8 +115,16 @@ def correct_pairs(
     """
     flows: list[np.ndarray] = []
     rows = []
-    columns = (pairs[name] for name in ("reference", "query", "split"))
-    for reference, query, split in zip(*columns, strict=True):
+    columns = [pairs[name] for name in ("reference", "query", "split")]
+    bar = tqdm(
+        zip(*columns, strict=True),
+        "correcting",
+        len(pairs),
+        unit="pair",
+        leave=False,
+        disable=not progress or matcher is None,
+    )
+    for reference, query, split in bar:
         if matcher is None or split != "train":
             rows.append((-1, np.nan, np.nan, ""))
             continue
@@ -143,10 +156,13 @@ def make_pairs(
     role: str,
     options: PrepConfig,
     tools: Tools,
+    progress: bool = False,
 ) -> None:
     """Choose and correct a sequence's pairs, unless they are there already."""
     if files.are_there():
         return
     with torch.inference_mode():
         chosen = choose_pairs(frames, name, role, options)
-        files.write(*correct_pairs(frames, chosen, tools.matcher(), options.correction_grid))
+        files.write(
+            *correct_pairs(frames, chosen, tools.matcher(), options.correction_grid, progress)
+        )

@@ -59,6 +59,8 @@ class Unit:
     """`train`, `test` or `train and test` (`split.Split.role`)."""
     capture_key: str
     """What its frames are made from (`CaptureKeys.frames_key`), but for the role."""
+    progress: bool = False
+    """Whether to show how far its pairs are: where the number of sequences says little."""
 
     @property
     def name(self) -> str:
@@ -125,4 +127,6 @@ def _prepare(unit: Unit) -> None:
         table = read_camera_table(unit.frames_folder, key)
         assert table is not None
     stored = StoredFrames.open(unit.frames_folder, table)
-    make_pairs(unit.pair_files, stored, unit.name, unit.role, shop.options, shop.tools)
+    make_pairs(
+        unit.pair_files, stored, unit.name, unit.role, shop.options, shop.tools, unit.progress
+    )

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from orbits import capture, even, ring
+from orbits import capture, even, ring, textured_capture
 
 from data_prep.build import prepare
 from data_prep.frames import block_median, object_square
-from extrap_train.config import PrepConfig
+from extrap_train.config import FlowMatcherConfig, PrepConfig
 from extrap_train.data.store import PreparedData
 from extrap_train.depth import DepthMap, DepthSource
 from extrap_train.depth.dataset import DatasetDepth
@@ -225,6 +225,24 @@ def test_finer_depths_are_reduced_to_one_of_their_own() -> None:
     depth[2:, :2] = torch.tensor([[2.0, float("inf")], [3.0, 4.0]])
     assert block_median(depth, 2).tolist() == [[5, 7, 0], [3, 0, 0]]
     assert block_median(depth, 1)[0].tolist() == [1, 5, 7, 0, 0, 0]
+
+
+def test_a_lone_sequence_shows_how_far_its_pairs_are(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sequences = [textured_capture("one", count=9, size=32)]
+    options = replace(OPTIONS, max_gap_deg=60.0, max_uses=2)
+    data = prepare(
+        sequences,
+        DatasetDepth(),
+        options,
+        test_names=1,
+        folder=tmp_path / "cup",
+        matcher=FlowMatcherConfig(),
+    )
+    said = capsys.readouterr().err
+    assert f"correcting:   0%|          | 0/{sum(data.manifest['pairs'].values())}" in said
+    assert "preparing: 100%" in said
 
 
 def test_photographs_too_close_together_make_no_pair(tmp_path: Path) -> None:
