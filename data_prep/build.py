@@ -129,7 +129,7 @@ def _is_finished(plan: _Plan, folder: Path, retry: bool) -> bool:
         LOG.warning("%s", error)
         return False
     if any(data.manifest.get(name) != key for name, key in plan.keys.items()):
-        print(f"{folder}: photographs, weights or this program have changed: brought up to date")
+        print(f"{folder}: made from other photographs, weights or options: brought up to date")
         return False
     failed = data.manifest["sequences"]["failed"]
     if failed and retry:
@@ -138,8 +138,8 @@ def _is_finished(plan: _Plan, folder: Path, retry: bool) -> bool:
     damaged = [unit.name for unit in _units_of(plan, data) if not unit.is_there]
     if damaged:
         LOG.warning(
-            "%s: of %d sequences (%s first) frames or pairs are damaged, gone or other ones by "
-            "now, and are made anew",
+            "%s: frames or pairs of %d sequences (first: %s) are damaged, gone or replaced: "
+            "made anew",
             folder,
             len(damaged),
             damaged[0],

@@ -72,7 +72,7 @@ def test_damage_is_noticed_and_mended_by_the_same_command(
     else:
         (folder / part).write_bytes(content)
     run(tmp_path, "cup", sequences, options).frames("cup/b", range(9))
-    assert "of 1 sequences (cup/b first) frames or pairs are damaged" in caplog.text
+    assert "frames or pairs of 1 sequences (first: cup/b) are damaged" in caplog.text
     assert (folder / part).read_bytes() == whole
     after = times(tmp_path / "frames", tmp_path / "pairs")
     assert {file.parent for file in before if after[file] != before[file]} == {folder}
