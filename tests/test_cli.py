@@ -9,7 +9,6 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -91,16 +90,15 @@ def test_a_full_disk_anywhere_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_p
 
 
 @pytest.mark.parametrize("place", ["file", "/proc/nowhere"])
-@pytest.mark.parametrize("start", [main, prepare])
 def test_an_output_that_can_be_no_folder_is_one_line(
-    place: str, start: Callable[[], None], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    place: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     (tmp_path / "file").write_text("not a folder")
     output = tmp_path / place
     options = ["category=hydrant", "data.train_sequences=1", f"output={output}"]
     monkeypatch.setattr(sys, "argv", ["command", *options])
     with pytest.raises(SystemExit) as stopped:
-        start()
+        prepare()
     message = str(stopped.value)
     assert re.fullmatch(rf"error: {output}.*choose another (output=|folder)", message), message
 
