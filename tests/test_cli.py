@@ -54,7 +54,7 @@ def _error(arguments: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
         (["category=hydrant", "~prep.image_size"], "prep.image_size"),
         (["category=hydrant", "hydrant"], "hydrant"),
         (["-m", "category=hydrnt,apple"], "did you mean hydrant"),
-        (["category=hydrant", "task=scne"], "task=scne is unknown; known: category"),
+        (["category=hydrant", "task=scne"], "task=scne is unknown; known: average, category"),
         (["category=hydrant", "model.prediction=eps"], "known: epsilon, v_prediction, sample"),
         (
             ["category=hydrant", "model.image_size=96"],
