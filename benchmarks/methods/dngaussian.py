@@ -105,7 +105,8 @@ class DnGaussianRecipe(Recipe):
     def __init__(self, options: DnGaussian, scene: TrainingScene) -> None:
         super().__init__(options, scene)
         source = monocular_source(scene, options.monocular)
-        self._priors = [filled(prior) for prior in prior_depths(scene, source)]
+        priors = prior_depths(scene, source, options.device)
+        self._priors = [filled(prior) for prior in priors]
         self._neural = None
         if options.color == "neural":
             with torch.random.fork_rng(devices=[]):
@@ -118,10 +119,9 @@ class DnGaussianRecipe(Recipe):
                         round(options.hash_finest * options.hash_bound),
                         options.hash_bound,
                     )
-                )
+                ).to(options.device)
         scene.record["color"] = options.color
-        self._cameras = [view.camera for view in scene.views]
-        self._nearest_expected = nearest_expected(self._cameras)
+        self._nearest_expected = nearest_expected(self.cameras)
         nearest = float(self._nearest_expected.min())
         scene.record["nearest"] = f"{nearest:.2f} extents from the inputs" if nearest else "unknown"
         self._soft_steps = 0
@@ -180,9 +180,9 @@ class DnGaussianRecipe(Recipe):
 
     @torch.no_grad()
     def _misplaced(self, parameters: GaussianParameters) -> Bool[Tensor, "n"]:
-        before = torch.zeros(len(parameters), dtype=torch.bool)
+        before = torch.zeros_like(parameters.opacity_logits, dtype=torch.bool)
         seen = before.clone()
-        for camera, nearest in zip(self._cameras, self._nearest_expected, strict=True):
+        for camera, nearest in zip(self.cameras, self._nearest_expected, strict=True):
             drawn = self.draw(parameters, camera).radii[0].amax(-1) > 0
             depth = parameters.means @ camera.world_to_cam[2, :3] + camera.world_to_cam[2, 3]
             before |= drawn & (depth < nearest)
@@ -213,7 +213,7 @@ class DnGaussianRecipe(Recipe):
         ).depth  # fmt: skip
         if not (prior > 0).any():
             return depth.sum() * 0
-        loss = torch.zeros(())
+        loss = depth.new_zeros(())
         for local, weight in ((True, options.local_weight), (False, options.global_weight)):
             least, greatest = options.patch_range
             drawn = torch.randint(least, greatest + 1, (1,), generator=training.generator)

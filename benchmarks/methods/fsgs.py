@@ -61,7 +61,7 @@ class FsgsRecipe(Recipe):
     def __init__(self, options: Fsgs, scene: TrainingScene) -> None:
         super().__init__(options, scene)
         self._monocular = monocular_source(scene, options.monocular)
-        self._priors = prior_depths(scene, self._monocular)
+        self._priors = prior_depths(scene, self._monocular, options.device)
         # A source whose depth comes with the data has none for a view that was never photographed.
         self._predicts = self._monocular.image_size is not None
         scene.record["pseudo views"] = "yes" if self._predicts else "no: depth comes with the data"
@@ -82,17 +82,17 @@ class FsgsRecipe(Recipe):
 
     def _pseudo_loss(self, training: Training) -> Float[Tensor, ""]:
         """The drawing's depth against what the network sees in the drawing, held fixed."""
-        camera = pseudo_camera([view.camera for view in self.scene.views], training.generator)
+        camera = pseudo_camera(self.cameras, training.generator)
         progress = training.iteration / self.options.iterations
         drawing = self.draw(training.optimiser.parameters, camera, progress)
         with torch.no_grad():
-            seen = View(drawing.image.clamp(0, 1), camera)
+            seen = View(drawing.image.clamp(0, 1).cpu(), camera.to("cpu"))
             try:
                 found = self._monocular.depth_map(seen, self.scene.views)
             except InputError as error:
                 self.scene.record["pseudo views"] = f"some had no depth: {error}"
                 return drawing.depth.sum() * 0
-        return pearson_depth_loss(drawing.depth, found.reliable())
+        return pearson_depth_loss(drawing.depth, found.reliable().to(drawing.depth))
 
     def grow(self, training: Training) -> None:
         """Grow as 3DGS does and, early in the training, unpool into the room that is left."""
@@ -110,6 +110,7 @@ class FsgsRecipe(Recipe):
             max(options.max_gaussians - count, 0),
         )
         training.optimiser.append(new)
-        training.statistics.follow(torch.ones(count, dtype=torch.bool), len(new))
+        all_kept = new.means.new_ones(count, dtype=torch.bool)
+        training.statistics.follow(all_kept, len(new))
         if limited:
             self.scene.record["unpooling"] = f"stopped at {options.max_gaussians} Gaussians"

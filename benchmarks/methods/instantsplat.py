@@ -56,7 +56,7 @@ class InstantSplatRecipe(Recipe):
 
     def __init__(self, options: InstantSplat, scene: TrainingScene) -> None:
         super().__init__(options, scene)
-        self._poses = PoseCorrections(len(scene.views))
+        self._poses = PoseCorrections(len(scene.views)).to(options.device)
 
     def initial_points(self) -> Points:
         """Every reliable pixel that no better view shows already."""
@@ -68,7 +68,7 @@ class InstantSplatRecipe(Recipe):
             min(options.init_points, options.max_gaussians), self.generator
         )  # fmt: skip
         if options.confidence_rates:
-            self.means_factor = confidence_factor(points.confidence)[:, None]
+            self.means_factor = confidence_factor(points.confidence)[:, None].to(options.device)
         self.scene.record["init"] = f"{len(points)} points of the depth source, seen once"
         refined = "refined with the scene" if options.pose_rate > 0 else "as given"
         self.scene.record["poses"] = f"{refined}; targets moved along, no photograph of them used"
@@ -87,9 +87,8 @@ class InstantSplatRecipe(Recipe):
     @torch.no_grad()
     def target_cameras(self, cameras: Camera) -> Camera:
         """Moved as the input cameras have moved on the whole."""
-        count = range(len(self.scene.views))
-        given = [self.scene.views[index].camera for index in count]
-        return similarity_between(given, [self.camera(index) for index in count]).camera(cameras)
+        refined = [self.camera(index) for index in range(len(self.cameras))]
+        return similarity_between(self.cameras, refined).camera(cameras)
 
 
 def confidence_factor(confidence: Float[Tensor, "n"]) -> Float[Tensor, "n"]:

@@ -24,9 +24,9 @@ class GrowthStatistics:
     visits: Float[Tensor, "n"]
 
     @classmethod
-    def empty(cls, count: int) -> "GrowthStatistics":
-        """Nothing seen yet."""
-        return cls(*torch.zeros(2, count))
+    def empty(cls, means: Float[Tensor, "n 3"]) -> "GrowthStatistics":
+        """Nothing seen yet of Gaussians with these means."""
+        return cls(*means.new_zeros(2, len(means)))
 
     @torch.no_grad()
     def add(

@@ -20,7 +20,7 @@ def nearest_expected(cameras: Sequence[Camera]) -> Float[Tensor, "v"]:
     sides = [_sides(camera) for camera in cameras]
     origins = [camera.world_to_cam[:3, 3] for camera in cameras]
     if not all((side @ origin > 0).all() for side, origin in zip(sides, origins, strict=True)):
-        return torch.zeros(len(cameras))
+        return cameras[0].world_to_cam.new_zeros(len(cameras))
     found = []
     for side, origin in zip(sides, origins, strict=True):
         half_rad = torch.asin(side[:, 2]).view(2, 2).mean(1).min()

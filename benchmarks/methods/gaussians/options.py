@@ -8,7 +8,8 @@ from extrap_train.errors import InputError
 
 INITS = ("triangulated", "dense", "random")
 BACKGROUNDS = {"black": 0.0, "white": 1.0}
-RASTERIZERS = ("numba", "gsplat")
+RASTERIZERS = {"numba": "cpu", "gsplat": "cuda"}
+"""What draws, and the device that it draws on."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,11 @@ class GaussianOptions:
     reset_opacity: float = 0.01
     rasterizer: str = "numba"
     """`numba` on the CPU, or `gsplat` on a GPU."""
+
+    @property
+    def device(self) -> str:
+        """Where a fit runs. Points and depth are prepared, and random numbers drawn, on the CPU."""
+        return RASTERIZERS[self.rasterizer]
 
     def __post_init__(self) -> None:
         """InputError for the first option that cannot be meant."""

@@ -50,6 +50,10 @@ class GaussianParameters:
         """All parameters by name, not copied."""
         return dict(vars(self))
 
+    def to(self, device: torch.device | str) -> "GaussianParameters":
+        """The same parameters on another device."""
+        return from_tensors({name: value.to(device) for name, value in self.tensors().items()})
+
     def gaussians(self) -> Gaussians:
         """The values that are drawn; gradients lead back to the parameters."""
         sh = torch.cat([self.sh_dc, self.sh_rest], 1)
@@ -96,7 +100,7 @@ def nearest_neighbours(
     A point that is alone has itself at distance 1.
     """
     if len(positions) == 1:
-        return torch.ones(1, 1), torch.zeros(1, 1, dtype=torch.long)
+        return positions.new_ones(1, 1), positions.new_zeros(1, 1, dtype=torch.long)
     count = min(count, len(positions) - 1)
     array = positions.detach().cpu().double().numpy()
     distance, index = KDTree(array).query(array, k=count + 1)

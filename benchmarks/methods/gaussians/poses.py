@@ -58,7 +58,7 @@ def similarity_between(given: Sequence[Camera], refined: Sequence[Camera]) -> Si
         for a, b in zip(given, refined, strict=True)
     ]
     u, _, vh = torch.linalg.svd(torch.stack(turns).double().sum(0))
-    flip = torch.diag(torch.tensor([1.0, 1.0, float(torch.det(u @ vh).sign())]).double())
+    flip = torch.diag(u.new_tensor([1.0, 1.0, float(torch.det(u @ vh).sign())]))
     rotation = (u @ flip @ vh).to(turns[0])
     source = torch.stack([camera.center for camera in given]) @ rotation.T
     target = torch.stack([camera.center for camera in refined])
@@ -80,7 +80,7 @@ def aligned_to_photograph(
     translation, L1 where something is drawn, cosine decay, best step kept): a number made so must
     be marked, and no method gets one through the benchmark's protocol.
     """
-    corrections = PoseCorrections(1)
+    corrections = PoseCorrections(1).to(camera.world_to_cam.device)
     groups = [
         {"params": [parameter], "lr": rate}
         for parameter, rate in zip(

@@ -25,12 +25,14 @@ def monocular_source(scene: TrainingScene, name: str) -> DepthSource:
             raise InputError(f"monocular={name} is unknown; known: surrogate, depth_source")
 
 
-def prior_depths(scene: TrainingScene, source: DepthSource) -> list[Float[Tensor, "h w"]]:
-    """Depth of every input view up to an affine map; 0 where it is unknown.
+def prior_depths(
+    scene: TrainingScene, source: DepthSource, device: str
+) -> list[Float[Tensor, "h w"]]:
+    """Depth of every input view up to an affine map, on `device`; 0 where it is unknown.
 
     The record says in how many inputs there is any: in others, depth losses are silent.
     """
     priors = [found.reliable() for found in source.depth_maps(scene.given)]
     known = sum(bool((prior > 0).any()) for prior in priors)
     scene.record["monocular depth"] = f"in {known} of {len(priors)} inputs"
-    return priors
+    return [prior.to(device) for prior in priors]

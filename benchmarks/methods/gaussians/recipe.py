@@ -60,10 +60,12 @@ class Recipe:
         self.generator = torch.Generator().manual_seed(scene.seed)
         self.background = BACKGROUNDS[options.background]
         self._rasterize = rasterizer(options.rasterizer)
-        self._photographs = [photograph(view.image) for view in scene.views]
+        self.cameras = [view.camera.to(options.device) for view in scene.views]
+        """Of the inputs, where the fit runs; `scene` stays on the CPU."""
+        self._photographs = [photograph(view.image.to(options.device)) for view in scene.views]
 
     def initial_points(self) -> Points:
-        """The points that training starts from; the record says which."""
+        """The points that training starts from, on the CPU; the record says which."""
         options, views = self.options, self.scene.views
         cameras = [view.camera for view in views]
         match options.init:
@@ -90,7 +92,7 @@ class Recipe:
 
     def camera(self, index: int) -> Camera:
         """The camera of an input view."""
-        return self.scene.views[index].camera
+        return self.cameras[index]
 
     def target_cameras(self, cameras: Camera) -> Camera:
         """Cameras of the frame, as the trained Gaussians are to be drawn from."""
@@ -104,7 +106,7 @@ class Recipe:
         """The Gaussians with colours that spherical harmonics hold: those of `colors`, where there
         are such, as the inputs see them on the mean.
         """
-        cameras = [self.camera(index) for index in range(len(self.scene.views))]
+        cameras = [self.camera(index) for index in range(len(self.cameras))]
         seen = [self.colors(parameters, camera) for camera in cameras]
         colors = [each for each in seen if each is not None]
         if not colors:
@@ -168,6 +170,6 @@ class Recipe:
             self.grow(training)
             was_reset = options.reset_every > 0 and step > schedule.at(options.reset_first)
             prune(training.optimiser, training.statistics, options, large_too=was_reset)
-            training.statistics = GrowthStatistics.empty(len(training.optimiser))
+            training.statistics = GrowthStatistics.empty(training.optimiser.parameters.means)
         if schedule.due(step, options.reset_first, options.reset_every, LEAST_BETWEEN_RESETS):
             reset_opacity(training.optimiser, options.reset_opacity)

@@ -38,7 +38,7 @@ class Diverged(InputError):
 
 @dataclass(frozen=True)
 class Fit:
-    """A trained scene."""
+    """A trained scene, on the device that it was fitted on; what it gives is on the CPU."""
 
     parameters: GaussianParameters
     recipe: Recipe
@@ -46,10 +46,11 @@ class Fit:
     @torch.no_grad()
     def render(self, targets: Camera) -> Float[Tensor, "n 3 h w"]:
         """The images of cameras of the world (batched `n`), in [0, 1]."""
-        cameras = self.recipe.target_cameras(self.recipe.scene.frame.camera(targets))
+        cameras = self.recipe.scene.frame.camera(targets).to(self.recipe.options.device)
+        cameras = self.recipe.target_cameras(cameras)
         count = len(targets.world_to_cam)
         drawn = [self.recipe.draw(self.parameters, cameras[i]).image for i in range(count)]
-        return torch.stack(drawn).clamp(0, 1)
+        return torch.stack(drawn).clamp(0, 1).cpu()
 
     @property
     def record(self) -> dict[str, str]:
@@ -67,11 +68,11 @@ class Fit:
         return Gaussians(
             frame.to_world(drawn.means), drawn.quats, drawn.scales * frame.unit,
             drawn.opacities, drawn.sh,
-        )  # fmt: skip
+        ).to("cpu")  # fmt: skip
 
 
 def fit(recipe: Recipe, points: Points | None = None, show_progress: bool = False) -> Fit:
-    """Train from the recipe's own initial points, or from those given (in the frame).
+    """Train from the recipe's own initial points, or from those given (in the frame, on the CPU).
 
     The same recipe, points and seed give the same Gaussians on a CPU. Raises InputError without
     usable points, `Diverged` where the loss or anything that is learnt stops being finite.
@@ -83,9 +84,10 @@ def fit(recipe: Recipe, points: Points | None = None, show_progress: bool = Fals
     widest = WIDEST_START * torch.cdist(start.positions, eyes).amin(1)
     parameters = parameters_from_points(start, options.sh_degree, options.init_opacity, widest)
     rates = learning_rates(options, schedule, progress=0.0)
+    parameters = parameters.to(options.device)
     training = Training(
         GaussianOptimiser(parameters, rates),
-        GrowthStatistics.empty(len(parameters)),
+        GrowthStatistics.empty(parameters.means),
         schedule,
         recipe.generator,
     )

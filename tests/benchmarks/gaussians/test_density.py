@@ -45,7 +45,7 @@ def _generator() -> torch.Generator:
 
 
 def test_gradients_are_in_ndc_and_a_visit():
-    statistics = GrowthStatistics.empty(2)
+    statistics = GrowthStatistics.empty(torch.zeros(2, 3))
     gradient = torch.tensor([[3.0, 0.0], [1.0, 1.0]])
     statistics.add(gradient, torch.tensor([5.0, 0.0]), height=20, width=10)
     statistics.add(torch.tensor([[0.0, 1.0], [0.0, 0.0]]), torch.tensor([2.0, 0.0]), 20, 10)

@@ -77,7 +77,7 @@ def _left_of(positions: torch.Tensor) -> torch.Tensor:
     points = Points(positions, torch.rand(count, 3), torch.ones(count))
     training = Training(
         GaussianOptimiser(parameters_from_points(points, 0, 0.5, widest=0.01), RATES),
-        GrowthStatistics.empty(count),
+        GrowthStatistics.empty(positions),
         Schedule(100, 100),
         recipe.generator,
         iteration=26,

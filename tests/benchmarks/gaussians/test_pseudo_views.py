@@ -51,7 +51,7 @@ def _under_way(network: _Network) -> tuple[FsgsRecipe, Training]:
     start = parameters_from_points(recipe.initial_points(), 0, 0.5, widest=0.1)
     return recipe, Training(
         GaussianOptimiser(start, RATES),
-        GrowthStatistics.empty(len(start)),
+        GrowthStatistics.empty(start.means),
         Schedule(OPTIONS.iterations, OPTIONS.full_iterations),
         recipe.generator,
         iteration=20,
