@@ -14,9 +14,7 @@ from extrap_train.config import (
 from extrap_train.device import fastest_device
 from extrap_train.errors import InputError
 from extrap_train.matching import Matcher
-from extrap_train.matching.aliked import AlikedMatcher, read_aliked
 from extrap_train.matching.flow import FlowMatcher
-from extrap_train.matching.loftr import LoftrMatcher, read_loftr
 
 
 def matcher(
@@ -32,9 +30,14 @@ def matcher(
         case FlowMatcherConfig():
             return FlowMatcher(config)
         case LoftrMatcherConfig():
+            # kornia takes each process a hundred megabytes: only where it is wanted.
+            from extrap_train.matching.loftr import LoftrMatcher, read_loftr
+
             loftr = read_loftr(_weights(config, option), config, f"{option}.checkpoint")
             return LoftrMatcher(config, loftr.to(device))
         case AlikedMatcherConfig():
+            from extrap_train.matching.aliked import AlikedMatcher, read_aliked
+
             aliked = read_aliked(_weights(config, option), config, f"{option}.checkpoint")
             return AlikedMatcher(config, aliked.to(device))
         case _:
