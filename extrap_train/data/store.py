@@ -43,6 +43,10 @@ from extrap_train.views import Camera, ViewPair
 FORMAT = 3
 UNTOUCHED = -1
 """In place of the number of a flow: the warp of that pair stays as it is."""
+_REPEATED = ("sequence", "split", "uncorrected")
+"""Columns whose words come again row after row: kept as codes, as a million pairs have two million
+such words, which would take a quarter of a gigabyte.
+"""
 _OPEN_SEQUENCES = 128
 """Sequences whose files stay open: four descriptors each, and a process has about a thousand."""
 
@@ -105,7 +109,7 @@ class PreparedData:
         """`train`, `test` or `train and test` of every sequence that is kept."""
         self._frames_root = folder / manifest["frames"]
         self._pairs_root = folder / manifest["pair_files"]
-        self._pair_rows = _row_ranges(pairs["sequence"].to_numpy())
+        self._pair_rows = _row_ranges(_values(pairs["sequence"]))
         self._flow_numbers: Callable[[str], np.ndarray] = lru_cache(_OPEN_SEQUENCES)(
             self._read_flow_numbers
         )
@@ -133,7 +137,7 @@ class PreparedData:
         if split not in ("train", "test"):
             raise ValueError(f"split is train or test, not {split!r}")
         rows = self._pairs[self._pairs["split"] == split]
-        return Pairs(*(rows[field.name].to_numpy() for field in fields(Pairs)))
+        return Pairs(*(_values(rows[field.name]) for field in fields(Pairs)))
 
     def cameras(self, sequence: str) -> Camera:
         """All cameras of a sequence, at the store's image size."""
@@ -235,7 +239,8 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 def _read_table(folder: Path, name: str) -> pa.Table:
     file = folder / f"{name}.parquet"
     try:
-        return pq.read_table(file).combine_chunks()
+        words = [name for name in _REPEATED if name in pq.read_schema(file).names]
+        return pq.read_table(file, read_dictionary=words).combine_chunks()
     except (OSError, pa.ArrowInvalid) as error:
         reason = str(error).splitlines()[0]
         raise _damaged(folder, f"{file}: {reason}") from None
@@ -250,6 +255,15 @@ def _damaged(folder: Path, what: str) -> InputError:
 def _roles(sequences: pd.DataFrame) -> dict[str, str]:
     kept = sequences[sequences["kept"]]
     return dict(zip(kept["sequence"], kept["split"], strict=True))
+
+
+def _values(column: pd.Series) -> np.ndarray:
+    """A column's values, equal words being one object."""
+    if isinstance(column.dtype, pd.CategoricalDtype):
+        words = column.cat.categories.to_numpy(dtype=object)
+        found: np.ndarray = words[column.cat.codes]
+        return found
+    return column.to_numpy()
 
 
 def _row_ranges(sequences: np.ndarray) -> dict[str, slice]:

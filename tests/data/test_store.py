@@ -73,6 +73,13 @@ def test_pairs_stay_within_their_split(folder: Path) -> None:
         data.pairs("validation")
 
 
+def test_a_million_pairs_do_not_repeat_their_names(folder: Path) -> None:
+    pairs = PreparedData.open(folder).pairs("train")
+    assert len(pairs) > len(set(pairs.sequence))
+    for words in (pairs.sequence, pairs.uncorrected):
+        assert len({id(word) for word in words}) == len(set(words))
+
+
 def test_another_process_gets_the_folder_not_the_frames(folder: Path) -> None:
     data = PreparedData.open(folder)
     data.frames("cup/a", [0])
