@@ -75,7 +75,6 @@ def plain(model: ExtrapolationModel) -> ExtrapolationModel:
     """The same network without optimisations: attention as three products, contiguous layout."""
     copied = copy.deepcopy(model).to(memory_format=torch.contiguous_format)
     copied.unet.set_attn_processor(AttnProcessor())
-    copied.unet.disable_gradient_checkpointing()
     return copied
 
 

@@ -1,5 +1,5 @@
 """A training step at the full size's make: mixed precision, fused attention and optimiser, channels
-last, gradient checkpointing, against the same network in plain float32.
+last, against the same network in plain float32.
 """
 
 from collections.abc import Callable
