@@ -5,7 +5,7 @@ import json
 import os
 import platform
 import shutil
-from dataclasses import asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -109,10 +109,15 @@ def open_run(config: TrainConfig) -> RunFolder:
 
 def existing_run(config: TrainConfig) -> RunFolder:
     """The finished run that `run` names, by default the newest; InputError where there is none."""
-    folder = RunFolder(_runs_of(config) / (config.run or _LATEST))
+    folder = RunFolder(_runs_of(config) / config.run) if config.run else newest_run(config)
     if not folder.summary.is_file():
         raise InputError(f"{folder.path}: holds no finished run; train one (task=category)")
     return folder
+
+
+def newest_run(config: TrainConfig) -> RunFolder:
+    """Where the category's newest run is, if there is one."""
+    return RunFolder(_runs_of(config) / _LATEST)
 
 
 def _runs_of(config: TrainConfig) -> Path:
@@ -153,7 +158,8 @@ def _default(config: Any, key: str) -> Any:
     *parents, name = key.split(".")
     for parent in parents:
         config = getattr(config, parent)
-    return next(field.default for field in fields(config) if field.name == name)
+    option = next(field for field in fields(config) if field.name == name)
+    return option.default if option.default_factory is MISSING else option.default_factory()
 
 
 def point_latest(folder: RunFolder) -> None:

@@ -29,6 +29,7 @@ class PowerAverages(Callback):
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.averages: dict[str, dict[str, Tensor]] = {}
+        self._exponents = {str(width): exponent_of(width) for width in TRACKED_WIDTHS}
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Begin with the weights as they are, which the first step replaces."""
@@ -50,7 +51,7 @@ class PowerAverages(Callback):
         """Take the step's weights in."""
         values = list(_trained(pl_module).values())
         for width, means in self.averages.items():
-            taken = 1 - decay_at(trainer.global_step, exponent_of(float(width)))
+            taken = 1 - decay_at(trainer.global_step, self._exponents[width])
             torch._foreach_lerp_(list(means.values()), values, taken)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:

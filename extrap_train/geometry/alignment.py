@@ -34,6 +34,7 @@ _CHI3_MEDIAN = 1.538
 _GAUSSIAN_MEDIAN = 0.6745
 _FAR_WORSE = 3.0
 _TIE = 1e-4
+"""Relative difference of two distances below which rounding would decide between them."""
 _LEAST_SPREAD = 1e-5
 """Relative residuals below are rounding."""
 

@@ -47,8 +47,9 @@ from extrap_train.reconstruction.map_files import load_map, load_steps, save_ste
 from extrap_train.reconstruction.planner import Query, expected_order, orbit_queries
 from extrap_train.reconstruction.pose_check import check_poses
 from extrap_train.reconstruction.viewer import CloudViewer
+from extrap_train.runs import newest_run
 from extrap_train.tasks.completed import Completed, write_completed
-from extrap_train.tasks.scene_inputs import newest_model, required_scene, trained_model
+from extrap_train.tasks.scene_inputs import required_scene, trained_model
 from extrap_train.views import stack_cameras, stack_poses
 
 _NOT_PART_OF_THE_MAP = (
@@ -204,7 +205,7 @@ def _identity(job: _Job) -> dict[str, Any]:
         "depth": asdict(config.depth),
         **complete_options,
         "sampler": asdict(config.sampler),
-        "weights": None if exact else config.weights or str(newest_model(config).resolve()),
+        "weights": None if exact else config.weights or str(newest_run(config).model.resolve()),
         "adapter": config.adapter,
         "seed": config.seed,
     }

@@ -16,6 +16,7 @@ from extrap_train.diffusion.checkpoint import load_model, packaged_weights
 from extrap_train.diffusion.lora import load_adapter
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError
+from extrap_train.runs import newest_run
 from extrap_train.views import View
 
 
@@ -62,20 +63,13 @@ def trained_model(config: TrainConfig) -> ExtrapolationModel:
     """The model that `weights` names, by default the category's newest, with its adapter if any."""
     if config.weights is not None:
         return open_model(config.weights, config.adapter)
-    newest = newest_model(config)
+    newest = newest_run(config).model
     if not newest.is_dir():
         raise InputError(
             f"{newest}: there is no trained model of {config.category.name}; train one "
-            "(task=category), or "
-            "give weights=FOLDER, or weights=base for the packaged model"
+            "(task=category), or give weights=FOLDER, or weights=base for the packaged model"
         )
     return open_model(str(newest), config.adapter)
-
-
-def newest_model(config: TrainConfig) -> Path:
-    """Where the category's newest run leaves its model."""
-    runs = Path(config.output) / "train" / config.category.name / config.model.name
-    return runs / "latest" / "model"
 
 
 def open_model(weights: str, adapter: str | None = None) -> ExtrapolationModel:
