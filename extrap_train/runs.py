@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 import platform
 import shutil
 from dataclasses import MISSING, asdict, dataclass, fields
@@ -14,7 +13,7 @@ import torch
 import yaml
 
 from extrap_train.config import SceneOptions, SyntheticConfig, TrainConfig, dotted
-from extrap_train.data.files import write_whole
+from extrap_train.data.files import partial_beside, write_whole
 from extrap_train.errors import InputError
 
 _NOT_PART_OF_THE_RUN = (
@@ -165,7 +164,7 @@ def _default(config: Any, key: str) -> Any:
 def point_latest(folder: RunFolder) -> None:
     """Let `latest` mean this run: once its data are known to be usable."""
     link = folder.path.with_name(_LATEST)
-    temporary = link.with_name(f".latest.{os.getpid()}")
+    temporary = partial_beside(link)
     temporary.unlink(missing_ok=True)
     temporary.symlink_to(folder.path.name)
     temporary.replace(link)

@@ -27,7 +27,7 @@ from rich.progress import (
 )
 from torch import Tensor
 
-from extrap_train.data.files import write_whole
+from extrap_train.data.files import partial_beside, write_whole
 from extrap_train.errors import InputError
 
 _KEPT = 2
@@ -41,7 +41,7 @@ class WholeCheckpointIO(TorchCheckpointIO):
     ) -> None:
         """Write under a temporary name, then rename."""
         path = Path(path)
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        temporary = partial_beside(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             torch.save(checkpoint, temporary)  # not by way of memory: it is 14 GB at full size

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -14,7 +13,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from extrap_train.config import ClipConfig, ModelConfig, UNetConfig, VaeConfig
-from extrap_train.data.files import write_whole
+from extrap_train.data.files import partial_beside, write_whole
 from extrap_train.diffusion.autoencoder import PixelPatches
 from extrap_train.diffusion.compact import compress, restore
 from extrap_train.diffusion.model import ExtrapolationModel
@@ -52,7 +51,7 @@ def save_model(model: ExtrapolationModel, folder: Path, dtype: torch.dtype = tor
 
     The folder appears complete or not at all; an older one of that name is replaced.
     """
-    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
+    temporary = partial_beside(folder)
     shutil.rmtree(temporary, ignore_errors=True)
     try:
         _write_config(model, temporary)
@@ -81,7 +80,7 @@ def save_compact(model: ExtrapolationModel, folder: Path, base: str = "base") ->
     """
     start = packaged_weights(base)
     tensors = compress(_state(model), _state(load_model(start)))
-    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
+    temporary = partial_beside(folder)
     shutil.rmtree(temporary, ignore_errors=True)
     try:
         _write_config(model, temporary)

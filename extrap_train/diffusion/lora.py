@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from safetensors.torch import load_file
 from torch import nn
 
 from extrap_train.config import LoraConfig
-from extrap_train.data.files import write_whole
+from extrap_train.data.files import partial_beside, write_whole
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError
 
@@ -41,7 +40,7 @@ def add_adapter(model: ExtrapolationModel, options: LoraConfig, seed: int) -> pe
 
 def save_adapter(adapter: peft.PeftModel, folder: Path) -> None:
     """Write a peft adapter folder, whole or not at all; an older one of that name is replaced."""
-    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
+    temporary = partial_beside(folder)
     shutil.rmtree(temporary, ignore_errors=True)
     try:
         adapter.save_pretrained(str(temporary))
