@@ -60,10 +60,13 @@ def snr_weights(
 ) -> Float[Tensor, " b"]:
     """Min-SNR-γ: the error of the clean sample weighed by min(SNR, γ) (Hang et al. 2023).
 
-    In terms of ε that is min(SNR, γ)/SNR, of v min(SNR, γ)/(SNR + 1). At zero terminal SNR it is 0:
-    the noisiest step learns nothing from itself.
+    In terms of ε that is min(SNR, γ)/SNR, of v min(SNR, γ)/(SNR + 1). With zero terminal SNR that
+    would leave the noisiest step, where sampling starts, without any weight: there it is
+    min(SNR + 1, γ), which is v's even weight (Lin et al. 2023) under the same bound, and what
+    Salimans and Ho 2022 give few-step models for this reason.
     """
     alpha = schedule.alphas_cumprod.to(timestep.device)[timestep]
     snr = alpha / (1 - alpha)
+    weight = snr + 1 if schedule.config["rescale_betas_zero_snr"] else snr
     per_unit = {"epsilon": snr, "sample": torch.ones_like(snr), "v_prediction": snr + 1}
-    return snr.clamp(max=gamma) / per_unit[schedule.config["prediction_type"]]
+    return weight.clamp(max=gamma) / per_unit[schedule.config["prediction_type"]]

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from extrap_train.config import ModelConfig
-from extrap_train.diffusion.loss import diffusion_loss, snr_weights
+from extrap_train.diffusion.loss import diffusion_loss, prediction_errors, snr_weights
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.schedule import noise_schedule
 from extrap_train.views import PairBatch
@@ -27,9 +27,30 @@ def test_min_snr_is_one_weighting_of_the_clean_sample_whatever_is_predicted(
     torch.testing.assert_close(snr_weights(schedule, timestep, 5.0) * squared, expected)
 
 
-def test_at_zero_terminal_snr_the_noisiest_step_weighs_nothing(config: ModelConfig) -> None:
-    schedule = noise_schedule(replace(config, prediction="v_prediction"))
-    assert snr_weights(schedule, torch.tensor([999]), 5.0).tolist() == [0.0]
+@pytest.mark.parametrize("prediction", ["v_prediction", "sample"])
+def test_at_zero_terminal_snr_no_step_is_without_weight(
+    config: ModelConfig, prediction: str
+) -> None:
+    """Sampling starts at the noisiest step: v has its even weight there, the sample as much."""
+    schedule = noise_schedule(replace(config, prediction=prediction))
+    weights = snr_weights(schedule, torch.arange(1000), 5.0)
+    assert float(schedule.alphas_cumprod[999]) == pytest.approx(0, abs=1e-6)
+    assert float(weights[999]) == pytest.approx(1, abs=1e-5)
+    per_sample = weights * ((1 / (1 - schedule.alphas_cumprod)) if prediction[0] == "v" else 1)
+    assert float(per_sample.min()) == pytest.approx(1, abs=1e-5)
+    assert float(per_sample.max()) == pytest.approx(5)
+
+
+def test_a_weighed_model_learns_at_the_noisiest_step(config: ModelConfig, batch: PairBatch) -> None:
+    model = ExtrapolationModel(config)
+    torch.nn.init.normal_(model.unet.conv_out.weight, std=0.1)
+    conditioning = model.condition(batch)
+    target = model.encode_target(batch.image, conditioning)
+    noisiest = torch.full((len(target),), 999)
+    errors = prediction_errors(model, target, torch.ones_like(target), noisiest, conditioning)
+    (errors * snr_weights(model.schedule, noisiest, 5.0)).mean().backward()
+    assert model.unet.conv_out.weight.grad is not None
+    assert model.unet.conv_out.weight.grad.abs().max() > 0
 
 
 def test_weights_change_the_loss_and_not_the_noise(config: ModelConfig, batch: PairBatch) -> None:
