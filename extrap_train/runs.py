@@ -33,6 +33,9 @@ _NOT_PART_OF_THE_RUN = (
 machine goes about the same mathematics, and what other tasks read.
 """
 
+_ADDED = {"model.joint_views": 1}
+"""Options that came later, with the value that leaves all as it was: runs keep their names."""
+
 _LATEST = "latest"
 """Link to the newest run of a model and category."""
 _PACKAGES = ("torch", "lightning", "diffusers", "numba", "numpy", "extrap-train")
@@ -85,6 +88,11 @@ def run_identity(config: TrainConfig) -> dict[str, Any]:
     }
 
 
+def _digest(identity: dict[str, Any]) -> str:
+    named = {k: v for k, v in identity.items() if k not in _ADDED or v != _ADDED[k]}
+    return hashlib.sha256(json.dumps(named, sort_keys=True).encode()).hexdigest()
+
+
 def open_run(config: TrainConfig) -> RunFolder:
     """Make or find the run's folder and write its configuration.
 
@@ -92,8 +100,7 @@ def open_run(config: TrainConfig) -> RunFolder:
     where a run of that name was started with other options and is to be resumed.
     """
     identity = run_identity(config)
-    digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:8]
-    name = config.run or f"seed{config.seed}-{digest}"
+    name = config.run or f"seed{config.seed}-{_digest(identity)[:8]}"
     if name == _LATEST or Path(name).name != name:
         raise InputError(f"run={name}: must be the name of a folder, other than {_LATEST}")
     path = _runs_of(config) / name
@@ -172,9 +179,8 @@ def point_latest(folder: RunFolder) -> None:
 
 def provenance(config: TrainConfig, data_hashes: dict[str, str]) -> dict[str, Any]:
     """What a result was made with: configuration, data, seed, device and versions."""
-    identity = json.dumps(run_identity(config), sort_keys=True)
     return {
-        "config": hashlib.sha256(identity.encode()).hexdigest(),
+        "config": _digest(run_identity(config)),
         "data": data_hashes,
         "seed": config.seed,
         "start": config.model.start,

@@ -18,6 +18,9 @@ from extrap_train.config import DatasetDepthConfig as Depth
 from extrap_train.errors import InputError
 from extrap_train.runs import open_run, point_latest
 
+_NAME_BEFORE = "seed0-ca916ebe"
+"""Of the default run of a category, from when the last option was added that had to rename it."""
+
 
 @pytest.fixture
 def config(tmp_path: Path) -> TrainConfig:
@@ -101,3 +104,13 @@ def test_another_download_is_another_run(config: TrainConfig) -> None:
 def test_a_run_has_the_name_of_a_folder(config: TrainConfig, name: str) -> None:
     with pytest.raises(InputError, match="must be the name of a folder"):
         open_run(replace(config, run=name))
+
+
+def test_an_option_that_changes_nothing_renames_no_run(config: TrainConfig) -> None:
+    """Runs made before there was `model.joint_views` are found again; it makes another when set."""
+    assert open_run(config).path.name == _NAME_BEFORE
+    together = replace(config, model=replace(config.model, joint_views=2))
+    assert open_run(together) != open_run(config)
+    open_run(replace(config, run="mine"))
+    with pytest.raises(InputError, match=r"model\.joint_views \(was 1, now 2\)"):
+        open_run(replace(together, run="mine"))

@@ -53,6 +53,7 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "model.patch": (1, 64),
     "model.references": (1, 16),
     "model.octaves": (1, 16),
+    "model.joint_views": (1, 64),
     "model.unet.layers_per_block": (1, 16),
     "model.unet.heads": (1, 64),
     "model.projection_rate": (0, math.inf),
@@ -124,6 +125,7 @@ def validate(config: TrainConfig | DataPrepConfig, tasks: tuple[str, ...]) -> No
         _check_one_of("trainer.accelerator", config.trainer.accelerator, _ACCELERATORS)
         _check_intervals(config.trainer)
         _check_model(config.model, config.prep)
+        _check_groups(config)
         _check_completion(config)
         _check_sampler(config.sampler)
 
@@ -206,6 +208,16 @@ def _check_intervals(trainer: TrainerConfig) -> None:
         raise InputError(
             f"trainer.validate_every={trainer.validate_every} is no multiple of "
             f"trainer.checkpoint_every={trainer.checkpoint_every}: give one that is"
+        )
+
+
+def _check_groups(config: TrainConfig) -> None:
+    """A batch is made of whole groups of views."""
+    views, together = config.trainer.batch_size, config.model.joint_views
+    if views % together:
+        raise InputError(
+            f"trainer.batch_size={views} is no multiple of model.joint_views={together}: give one "
+            "that is"
         )
 
 

@@ -67,8 +67,12 @@ class ModelConfig:
     octaves: int = 4
     """Of the positional encoding: 4 channels each."""
     geometry: bool = False
-    """Tell the denoiser the warp's depth and confidence, too; `ours` only. It then has two more
-    input channels, which the packaged base lacks: give model.start=null.
+    """Tell the denoiser the warp's depth and confidence, too; `ours` only: two more input channels,
+    which start at zero upon weights without them, the packaged base's among them.
+    """
+    joint_views: int = 1
+    """Queries of one scene that are denoised together, attending to each other; 1 paints each
+    alone. Weights are the same and start from each other.
     """
     residual: bool = True
     """Denoise the difference to the hole-filled warp instead of the image itself: to the fused one,

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset, Sampler
 
-from extrap_train.data.examples import ExampleReader, mirrored
+from extrap_train.data.examples import Example, ExampleReader, mirrored
 from extrap_train.geometry.reduction import reduced_batch
 from extrap_train.geometry.warp import warp_references
 from extrap_train.views import PairBatch
@@ -42,7 +42,8 @@ def with_warp(batch: PairBatch, image_size: int | None = None) -> PairBatch:
 
 
 class PositionSampler(Sampler[Positions]):
-    """Batches of one epoch from an endless stream of shuffled passes over the pairs.
+    """Batches of one epoch from an endless stream of shuffled passes over the pairs, `batch_size`
+    pairs in each.
 
     Nothing is remembered: `steps_done`, asked at the start of an epoch, says where in the stream it
     begins, however long the epochs before it were. So a killed run and a prolonged one see what an
@@ -89,17 +90,18 @@ class TrainingBatches(Dataset[PairBatch]):
         self.reader, self.references, self.seed = reader, references, seed
 
     def __getitem__(self, positions: Positions) -> PairBatch:
-        examples = []
+        examples: list[Example] = []
         for position, pair in positions:
             rng = np.random.default_rng((self.seed, position))
             count = int(rng.integers(1, self.references + 1))
-            example = self.reader.read(pair, count, rng)
-            examples.append(mirrored(example) if rng.random() < 0.5 else example)
+            group = self.reader.read(pair, count, rng)
+            examples += [mirrored(example) for example in group] if rng.random() < 0.5 else group
         return self.reader.collate(examples)
 
 
 class ValidationBatches(Dataset[PairBatch]):
-    """The same examples, with all their references, every time."""
+    """The same examples, with all their references, every time; where views are denoised together,
+    each with its group behind it."""
 
     def __init__(
         self, reader: ExampleReader, chosen: list[int], size: int, references: int
@@ -111,13 +113,18 @@ class ValidationBatches(Dataset[PairBatch]):
         return len(self.batches)
 
     def __getitem__(self, index: int) -> PairBatch:
-        rngs = [np.random.default_rng(pair) for pair in self.batches[index]]
-        chosen = zip(self.batches[index], rngs, strict=True)
-        return self.reader.collate([self.reader.read(p, self.references, rng) for p, rng in chosen])
+        groups = [
+            self.reader.read(pair, self.references, np.random.default_rng(pair))
+            for pair in self.batches[index]
+        ]
+        return self.reader.collate([example for group in groups for example in group])
 
 
 class PairModule(lightning.LightningDataModule):
-    """Training and validation batches; the warp is made after the batch has reached its device."""
+    """Training and validation batches; the warp is made after the batch has reached its device.
+
+    `batch_size` counts views: where groups of them are denoised together, it holds fewer pairs.
+    """
 
     def __init__(
         self,
@@ -136,8 +143,10 @@ class PairModule(lightning.LightningDataModule):
         super().__init__()
         self.train, self.validation = train, validation
         self.image_size = image_size
-        self.batch_size, self.batches_per_epoch = batch_size, batches_per_epoch
-        self.validation_batch_size, self.references = validation_batch_size, references
+        self.pairs_a_batch = batch_size // train.joint_views
+        self.batches_per_epoch = batches_per_epoch
+        self.validation_batch_size = max(1, validation_batch_size // validation.joint_views)
+        self.references = references
         self.workers, self.seed = workers, seed
         self.chosen = spread(len(validation), validation_examples)
 
@@ -146,7 +155,7 @@ class PairModule(lightning.LightningDataModule):
         trainer = self.trainer
         sampler = PositionSampler(
             len(self.train),
-            self.batch_size,
+            self.pairs_a_batch,
             self.batches_per_epoch,
             self.seed,
             steps_done=lambda: trainer.global_step if trainer else 0,

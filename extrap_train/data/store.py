@@ -175,6 +175,10 @@ class PreparedData:
         """The frames that make a training pair with this query, so that their flow is known."""
         return np.flatnonzero(self._flow_numbers(sequence)[:, query] >= UNTOUCHED)
 
+    def queries(self, sequence: str, reference: int) -> Int[np.ndarray, "m"]:
+        """The frames that make a training pair with this reference."""
+        return np.flatnonzero(self._flow_numbers(sequence)[reference] >= UNTOUCHED)
+
     def flows(
         self, sequence: str, references: Sequence[int], query: int
     ) -> Float[Tensor, "k 2 g g"]:

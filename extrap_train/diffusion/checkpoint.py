@@ -182,6 +182,9 @@ def load_weights(model: ExtrapolationModel, path: Path) -> None:
     family = _family(path, file, unet["conv_in.weight"])
     if family != model.config.family:
         _take_over(found, family, model)
+    elif model.config.geometry and _lacks_geometry(path, model.config):
+        channels = model.unet.conv_in.weight.shape[1]
+        unet["conv_in.weight"] = widened(unet["conv_in.weight"], channels)
     for part, (part_file, tensors) in found.items():
         part_file.fill(networks[part], tensors)
 
@@ -195,6 +198,12 @@ def _family(path: Path, file: WeightFile, conv_in: Tensor) -> str:
             f"its denoiser takes {channels} channels, where ZeroNVS's takes 8 and MegaScenes's 11"
         )
     return _PUBLISHED_CHANNELS[channels]
+
+
+def _lacks_geometry(path: Path, config: ModelConfig) -> bool:
+    """Whether all that a saved model's denoiser is not told is the warp's depth and confidence."""
+    saved = _saved_config(path)
+    return not saved.geometry and saved.octaves == config.octaves
 
 
 def _take_over(

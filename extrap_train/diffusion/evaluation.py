@@ -42,14 +42,17 @@ def predict(
     sampler: SamplerConfig,
     seed: int,
 ) -> Iterator[Prediction]:
-    """The model's sample and the baselines for every batch; one seed per view, by its name."""
+    """The model's sample and the baselines for every batch; one seed per view, by its name.
+
+    Of views that are denoised together the first has the name, and it alone is predicted.
+    """
     for batch, names in batches:
-        generators = [view_generator(seed, name) for name in names]
-        images = {
-            "model": sample_views(model, batch, sampler, generators),
-            **baseline_images(batch),
-        }
-        yield Prediction(batch, names, images)
+        beside = [f" beside {place}" if place else "" for place in range(batch.joint_views)]
+        generators = [view_generator(seed, name + place) for name in names for place in beside]
+        made = sample_views(model, batch, sampler, generators)
+        asked = batch.asked()
+        images = {"model": made[:: batch.joint_views], **baseline_images(asked)}
+        yield Prediction(asked, names, images)
 
 
 def score(prediction: Prediction, lpips: Distance | None) -> pd.DataFrame:

@@ -1,7 +1,7 @@
 """The view from a pose: posed views with depth in, pictures at the queries out."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from extrap_train.config import SamplerConfig
 from extrap_train.data.module import with_warp
-from extrap_train.data.queries import query_batch
+from extrap_train.data.queries import query_batch, query_groups
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sample_views, view_generator
 from extrap_train.views import Camera, View, Warp, combine
@@ -50,8 +50,8 @@ class ViewGenerator(Protocol):
         """Pictures of the queries (batched once), from views that have depth.
 
         A query's noise follows from `seed` and its name alone: the picture depends neither on the
-        queries beside it nor on their number. Raises InputError for degenerate cameras and for
-        views without depth.
+        queries beside it nor on their number, unless the model denoises several together. Raises
+        InputError for degenerate cameras and for views without depth.
         """
         ...
 
@@ -81,16 +81,40 @@ class DiffusionGenerator:
         """See `ViewGenerator.generate`."""
         if len(names) != len(queries.world_to_cam):
             raise ValueError(f"{len(names)} names for {len(queries.world_to_cam)} queries")
+        batches = self._batches(queries)
         parts = [
-            self._generate(references, queries[at : at + self.batch_size], names[at:], seed)
-            for at in range(0, len(names), self.batch_size)
+            self._generate(
+                references, queries[torch.tensor(at)], [names[i] for i in at], seed, together
+            )
+            for at, together in batches
         ]
-        whole = combine(parts, lambda tensors: torch.cat(list(tensors)))
+        order = torch.tensor([query for at, _ in batches for query in at]).argsort()
+        whole = combine(parts, lambda tensors: torch.cat(list(tensors))[order])
         chosen = [row for part in parts for row in part.references]
-        return GeneratedViews(whole.images, whole.cameras, whole.warp, chosen)
+        return GeneratedViews(
+            whole.images, whole.cameras, whole.warp, [chosen[place] for place in order.tolist()]
+        )
+
+    def _batches(self, queries: Camera) -> list[tuple[list[int], int]]:
+        """Which queries are denoised at a time, and how many of them together."""
+        together = self.model.config.joint_views
+        count = len(queries.world_to_cam)
+        groups = [[i] for i in range(count)] if together == 1 else query_groups(queries, together)
+        whole = [group for group in groups if len(group) == together]
+        size = max(1, self.batch_size // together)
+        batches = [
+            ([query for group in whole[at : at + size] for query in group], together)
+            for at in range(0, len(whole), size)
+        ]
+        return batches + [(group, len(group)) for group in groups[len(whole) :]]
 
     def _generate(
-        self, references: Sequence[View], queries: Camera, names: Sequence[str], seed: int
+        self,
+        references: Sequence[View],
+        queries: Camera,
+        names: Sequence[str],
+        seed: int,
+        joint_views: int,
     ) -> GeneratedViews:
         config = self.model.config
         size = config.warp_size
@@ -99,7 +123,8 @@ class DiffusionGenerator:
         with torch.autocast(device.type, enabled=False):
             batch, chosen = query_batch(references, queries, config.references, size)
             batch = with_warp(batch.to(device), config.image_size)
-        generators = [view_generator(seed, name) for name in names[: len(chosen)]]
+        batch = replace(batch, joint_views=joint_views)
+        generators = [view_generator(seed, name) for name in names]
         images = sample_views(self.model, batch, self.sampler, generators)
         assert batch.warp is not None
         made = GeneratedViews(images, batch.camera, batch.warp, chosen)

@@ -18,17 +18,19 @@ def diffusion_loss(
     condition_dropout: float,
     min_snr: float | None = None,
 ) -> Float[Tensor, ""]:
-    """Mean squared error of the prediction at one random noise level per example.
+    """Mean squared error of the prediction at one random noise level per example, or per group of
+    views that are denoised together.
 
     Every random number comes from the (CPU) generator, so that a step is a function of its seed
     alone. `min_snr` weighs the levels, see `snr_weights`.
     """
     conditioning = model.condition(batch)
     target = model.encode_target(batch.image, conditioning, generator)
-    count = len(target)
-    dropped = torch.rand(count, generator=generator) < condition_dropout
+    groups = len(target) // batch.joint_views
+    dropped = torch.rand(groups, generator=generator) < condition_dropout
     steps = model.schedule.config["num_train_timesteps"]
-    timestep = torch.randint(0, steps, (count,), generator=generator).to(target.device)
+    timestep = torch.randint(0, steps, (groups,), generator=generator).to(target.device)
+    dropped, timestep = (x.repeat_interleave(batch.joint_views) for x in (dropped, timestep))
     noise = torch.randn(target.shape, generator=generator).to(target)
     conditioning = conditioning.zeroed(dropped.to(target.device))
     errors = prediction_errors(model, target, noise, timestep, conditioning)

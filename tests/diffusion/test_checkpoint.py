@@ -13,6 +13,7 @@ from extrap_train.config import ModelConfig
 from extrap_train.diffusion.checkpoint import initial_model, load_model, save_model
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError
+from extrap_train.views import PairBatch
 
 
 def test_a_model_comes_back_as_it_was(config: ModelConfig, tmp_path: Path) -> None:
@@ -51,6 +52,21 @@ def test_weights_of_another_shape_are_refused(config: ModelConfig, tmp_path: Pat
     other = replace(config, octaves=5, start=str(tmp_path / "model"))
     with pytest.raises(InputError, match=r"another network's.*conv_in"):
         initial_model(other)
+
+
+def test_a_start_without_geometry_is_told_it_without_effect(
+    config: ModelConfig, tmp_path: Path, batch: PairBatch
+) -> None:
+    before = ExtrapolationModel(config).eval()
+    torch.nn.init.normal_(before.unet.conv_out.weight, std=0.1)
+    save_model(before, tmp_path / "model")
+    told = initial_model(replace(config, geometry=True, start=str(tmp_path / "model"))).eval()
+    steps = torch.tensor([3, 300, 900])
+    noisy = torch.randn(before.condition(batch).base.shape)
+    with torch.no_grad():
+        made = [model(noisy, steps, model.condition(batch)) for model in (before, told)]
+    torch.testing.assert_close(made[1], made[0])
+    assert told.unet.conv_in.weight.shape[1] == before.unet.conv_in.weight.shape[1] + 2
 
 
 @pytest.mark.parametrize("part", ["unet/diffusion_pytorch_model.safetensors", "image_encoder"])
