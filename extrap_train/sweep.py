@@ -1,4 +1,5 @@
-"""What `-m` leaves behind: `sweep.csv`, a row a job, and the same as a picture.
+"""What `-m` leaves behind: `sweep.csv`, a row a job, and the same as a picture; of jobs that differ
+in `seed` alone the means, in `seeds.md`.
 
 A Hydra callback (`hydra.callbacks` in conf/train.yaml). The table is written after every job, so
 that a sweep that is killed has the rows of what it finished, and a job that fails is a row like
@@ -22,6 +23,7 @@ from omegaconf import DictConfig
 
 from extrap_train.data.files import write_whole
 from extrap_train.errors import InputError, did_you_mean
+from extrap_train.sweep_seeds import over_seeds
 
 Row = dict[str, str]
 METRIC = "result."
@@ -60,6 +62,7 @@ class SweepTable(Callback):
         folder = Path(config.hydra.sweep.dir)
         rows = add_row(folder / "sweep.csv", row)
         draw(rows, folder / "sweep.png")
+        compare_over_seeds(rows, folder / "seeds.md")
         print(f"job {row['job']}: {row['status']} {row[_LAST]}".rstrip())
         print(f"sweep: {folder / 'sweep.csv'}", flush=True)
 
@@ -164,7 +167,7 @@ def draw(rows: list[Row], file: Path) -> None:
         return
     from matplotlib.figure import Figure  # a second that a single run need not wait
 
-    labels = [_label(row, done) for row in done]
+    labels = [_label(row, done) or f"job {row['job']}" for row in done]
     figure = Figure(
         figsize=(7, 0.6 + len(metrics) * (0.5 + 0.25 * len(done))), layout="constrained"
     )
@@ -182,6 +185,20 @@ def draw(rows: list[Row], file: Path) -> None:
     write_whole(file, content.getvalue())
 
 
+def compare_over_seeds(rows: list[Row], file: Path) -> None:
+    """The table of `over_seeds`, once a combination of overrides has run with two seeds."""
+    done = [row for row in rows if row["status"] == "ok" and "seed" in row]
+    metrics = _shown_metrics(done)
+    alike = [{**row, "seed": ""} for row in done]
+    labels = [_label(row, alike) or "every job" for row in alike]
+    if len(set(labels)) == len(labels) or not metrics:
+        return
+    columns = {
+        m.removeprefix(METRIC): [float(row.get(m, math.nan)) for row in done] for m in metrics
+    }
+    write_whole(file, over_seeds(labels, [row["seed"] for row in done], columns).encode())
+
+
 def _shown_metrics(rows: list[Row]) -> list[str]:
     """The model's own first, then whatever else the jobs measured."""
     names = dict.fromkeys(name for row in rows for name in row if name.startswith(METRIC))
@@ -193,4 +210,4 @@ def _label(row: Row, rows: list[Row]) -> str:
     """The overrides that tell the jobs apart."""
     options = [n for n in row if n not in (*_HEAD, _LAST) and not n.startswith(METRIC)]
     apart = [n for n in options if len({r.get(n) for r in rows}) > 1]
-    return " ".join(f"{name}={row[name]}" for name in apart) or f"job {row['job']}"
+    return " ".join(f"{name}={row.get(name, '')}" for name in apart)

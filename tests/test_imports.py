@@ -24,6 +24,7 @@ _RANK = {
     "extrap_train.diffusion": 5,
     "extrap_train.runs": 5,
     "extrap_train.sweep": 5,
+    "extrap_train.sweep_seeds": 2,
     "extrap_train.reconstruction": 6,
     "data_prep": 7,
     "benchmarks": 7,

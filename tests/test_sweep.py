@@ -13,6 +13,7 @@ from extrap_train.__main__ import main
 from extrap_train.config import TrainConfig
 from extrap_train.errors import InputError
 from extrap_train.sweep import add_row, read_rows
+from extrap_train.sweep_seeds import over_seeds
 
 Fake = Callable[[TrainConfig], Path]
 
@@ -60,6 +61,42 @@ def test_every_job_is_a_row_with_its_overrides_and_metrics(
     assert (table["status"] == "ok").all()
     assert (tmp_path / "sweep" / "sweep.png").stat().st_size > 1000
     assert capfd.readouterr().out.splitlines()[-1].endswith("sweep/sweep.csv")
+
+
+def test_jobs_that_differ_in_their_seed_have_a_mean(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    words = ["category=apple", "trainer.steps=1,2", "seed=0,1,2"]
+    assert _sweep(monkeypatch, _trained(tmp_path), tmp_path / "sweep", *words) is None
+    lines = (tmp_path / "sweep" / "seeds.md").read_text().splitlines()
+    assert [cell.strip() for cell in lines[0].split("|")[1:4]] == [
+        "",
+        "seeds",
+        "validation.model.psnr",
+    ]
+    assert lines[2].startswith("| trainer.steps=1 | 3 | 21.00 ± 0.00 |  |")
+    assert lines[3].startswith("| trainer.steps=2 | 3 | 22.00 ± 0.00 | +1.00 ± 0.00 |")
+
+
+def test_seeds_are_compared_one_by_one() -> None:
+    """What a seed does to all alike is no part of the difference's error."""
+    labels = ["old", "old", "old", "new", "new", "late"]
+    seeds = ["0", "1", "2", "1", "0", "7"]
+    psnr = [20.0, 22.0, 27.0, 22.5, 20.3, 19.0]
+    lpips = [0.1, 0.2, float("nan"), 0.3, 0.2, float("nan")]
+    table = over_seeds(labels, seeds, {"psnr": psnr, "lpips": lpips})
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()]
+    assert rows[0] == ["", "seeds", "psnr", "difference", "lpips", "difference"]
+    assert rows[2] == ["old", "3", "23.00 ± 2.08", "", "0.1500 ± 0.0500", ""]
+    assert rows[3] == [
+        "new",
+        "2",
+        "21.40 ± 1.10",
+        "+0.40 ± 0.10",
+        "0.2500 ± 0.0500",
+        "+0.1000 ± 0.0000",
+    ]
+    assert rows[4] == ["late", "1", "19.00", "–", "–", "–"]
 
 
 def test_a_failed_job_is_a_row_and_the_others_go_on(

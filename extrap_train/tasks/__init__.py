@@ -10,6 +10,7 @@ TASKS = (
     "complete",
     "pack",
     "scene",
+    "validate",
     "view",
 )
 """Known values of `task=`; each is a module here with `run(config)`."""

@@ -1,0 +1,22 @@
+"""`task=validate`: a finished run measured again, sampled as the options under `sampler` say."""
+
+import hashlib
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+from extrap_train.config import TrainConfig
+from extrap_train.diffusion.checkpoint import load_model
+from extrap_train.runs import RunFolder, existing_run
+from extrap_train.tasks.measure import measure
+
+
+def run(config: TrainConfig) -> Path:
+    """Sample the held-out views with the run's model and leave the scores beside the run's own."""
+    trained = existing_run(config)
+    steps = int(json.loads(trained.summary.read_text())["steps"])
+    how = {"sampler": asdict(config.sampler), "validation": asdict(config.validation)}
+    digest = hashlib.sha256(json.dumps(how, sort_keys=True).encode()).hexdigest()[:8]
+    folder = RunFolder(trained.path / "validations" / f"seed{config.seed}-{digest}")
+    measure(load_model(trained.model), steps, config, folder)
+    return folder.path
