@@ -119,7 +119,11 @@ def cell_jobs(
     methods: list[MethodConfig],
     scenes: list[Scene],
 ) -> list[CellJob]:
-    """A job a method and draw, scene by scene, each named by all that decides its result."""
+    """A job a method and draw, scene by scene, each named by all that decides its result.
+
+    Raises InputError for two methods that are the same: one cell cannot be two rows.
+    """
+    _require_different(methods)
     device = _device(table.device)
     scoring = digest(
         [
@@ -152,6 +156,17 @@ def cell_jobs(
                 )
             )
     return jobs
+
+
+def _require_different(methods: list[MethodConfig]) -> None:
+    known: dict[str, str] = {}
+    for method in methods:
+        same = known.setdefault(digest([method.factory, method.options]), method.name)
+        if same != method.name:
+            raise InputError(
+                f"methods {same} and {method.name} are the same, with the same options; leave one "
+                "out: methods=[...]"
+            )
 
 
 def _method_hashes(method: MethodConfig, category: str) -> dict[str, str]:

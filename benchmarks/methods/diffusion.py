@@ -1,7 +1,7 @@
 """Diffusion methods as rows of a table: a model of one family samples every target view."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis, Unavailable
+from benchmarks.methods.gaussians.checks import check_range
 from benchmarks.methods.references import views_with_depth
 from extrap_train.config import SamplerConfig
 from extrap_train.diffusion.checkpoint import load_model, packaged_weights
@@ -20,8 +21,22 @@ from extrap_train.errors import InputError
 
 
 @dataclass(frozen=True)
+class Painted:
+    """The targets as a model has painted them, and what else came of it; see `Synthesis`."""
+
+    images: Float[Tensor, "n 3 s s"]
+    """At the model's own size."""
+    given: Mapping[str, str] = field(default_factory=dict)
+    points: Float[Tensor, "m 3"] | None = None
+    counts: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Diffusion:
-    """Samples the targets, each from its nearest inputs, with a trained model."""
+    """Samples the targets, each from its nearest inputs, with a trained model.
+
+    A subclass that paints them otherwise has a `painted` of its own.
+    """
 
     family: str = "ours"
     """What the model is told; the weights must be of this family."""
@@ -29,16 +44,30 @@ class Diffusion:
     """A model folder, or the name of one in the package, where `{category}` stands for the
     capture's; null is `FAMILY-{category}` for ours, `FAMILY` for the category-agnostic others.
     """
+    references: int | None = None
+    """Most inputs that a target is warped from; null takes the model's number."""
     steps: int = 2
     guidance: float = 1.0
     eta: float = 0.0
+
+    def __post_init__(self) -> None:
+        """InputError for the first option that cannot be meant."""
+        if self.references is not None:
+            check_range("references", self.references, 1)
+
+    @property
+    def sampler(self) -> SamplerConfig:
+        """How every view is sampled."""
+        return SamplerConfig(steps=self.steps, guidance=self.guidance, eta=self.eta)
 
     def weight_files(self, category: str) -> Sequence[Path]:
         """The files of the model's folder."""
         return sorted(path for path in self._folder(category).rglob("*") if path.is_file())
 
     def synthesize(self, inputs: SceneInputs) -> Synthesis:
-        """Sample every target; the time is that of a single image, its warp included."""
+        """Paint every target; the time is that of a single image, its share of all that the scene
+        takes.
+        """
         folder = self._folder(inputs.category)
         model = _loaded(folder)
         if model.config.family != self.family:
@@ -46,17 +75,31 @@ class Diffusion:
                 f"{folder}: is a model of the family {model.config.family}, not {self.family}; "
                 "give weights= of the right one"
             )
-        sampler = SamplerConfig(steps=self.steps, guidance=self.guidance, eta=self.eta)
-        names = [f"target {i}" for i in range(len(inputs.targets.world_to_cam))]
         with Stopwatch() as watch:
-            made = DiffusionGenerator(model, sampler).generate(
-                views_with_depth(inputs), inputs.targets, names, inputs.seed
-            )
+            made = self.painted(model, inputs)
         size = (inputs.targets.height, inputs.targets.width)
         given = {"weights": folder.name, "depth": "used" if self.family != "zeronvs" else "scale"}
         if made.images.shape[-2:] != size:
             given["made at"] = f"{made.images.shape[-1]} px"
-        return Synthesis(_resampled(made.images, size), watch.seconds / len(names), given)
+        return Synthesis(
+            images=_resampled(made.images, size),
+            seconds=watch.seconds / len(made.images),
+            given=given | dict(made.given),
+            points=made.points,
+            counts=made.counts,
+        )
+
+    def painted(self, model: ExtrapolationModel, inputs: SceneInputs) -> Painted:
+        """Paint every target from the inputs alone. The model is shared: it stays as it is."""
+        made = self.generator(model).generate(
+            views_with_depth(inputs), inputs.targets, target_names(inputs), inputs.seed
+        )
+        given = {} if self.references is None else {"references": f"the nearest {self.references}"}
+        return Painted(made.images, given)
+
+    def generator(self, model: ExtrapolationModel) -> DiffusionGenerator:
+        """What paints views with this method's options."""
+        return DiffusionGenerator(model, self.sampler, references=self.references)
 
     def _folder(self, category: str) -> Path:
         default = f"{self.family}-{category}" if self.family == "ours" else self.family
@@ -78,6 +121,11 @@ class Diffusion:
             f"category={category}" if self.family == "ours" else f"experiment=small_{self.family}"
         )
         return f"python -m extrap_train {chosen}"
+
+
+def target_names(inputs: SceneInputs) -> list[str]:
+    """What the targets' noise is drawn by, the same for every method."""
+    return [f"target {index}" for index in range(len(inputs.targets.world_to_cam))]
 
 
 @lru_cache(2)

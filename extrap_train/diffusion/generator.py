@@ -58,12 +58,14 @@ class ViewGenerator(Protocol):
 
 @dataclass(frozen=True)
 class DiffusionGenerator:
-    """Samples the views with a diffusion model, from up to its number of nearest references."""
+    """Samples the views with a diffusion model, each from its nearest references."""
 
     model: ExtrapolationModel
     sampler: SamplerConfig
     batch_size: int = 16
     """Queries that are denoised at a time."""
+    references: int | None = None
+    """Most views that a query is warped from; None takes the model's number."""
 
     @property
     def image_size(self) -> int:
@@ -117,11 +119,11 @@ class DiffusionGenerator:
         joint_views: int,
     ) -> GeneratedViews:
         config = self.model.config
-        size = config.warp_size
+        size, most = config.warp_size, self.references or config.references
         device = next(self.model.parameters()).device
         # Geometry keeps its precision where the caller lets the network run in less.
         with torch.autocast(device.type, enabled=False):
-            batch, chosen = query_batch(references, queries, config.references, size)
+            batch, chosen = query_batch(references, queries, most, size)
             batch = with_warp(batch.to(device), config.image_size)
         batch = replace(batch, joint_views=joint_views)
         generators = [view_generator(seed, name) for name in names]

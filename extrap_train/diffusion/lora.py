@@ -3,6 +3,8 @@
 import hashlib
 import json
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +38,18 @@ def add_adapter(model: ExtrapolationModel, options: LoraConfig, seed: int) -> pe
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         return peft.get_peft_model(model.unet, config)
+
+
+@contextmanager
+def temporary_adapter(
+    model: ExtrapolationModel, options: LoraConfig, seed: int
+) -> Iterator[peft.PeftModel]:
+    """A new adapter upon the denoiser for as long as the block lasts, however it ends."""
+    adapter = add_adapter(model, options, seed)
+    try:
+        yield adapter
+    finally:
+        adapter.unload()
 
 
 def save_adapter(adapter: peft.PeftModel, folder: Path) -> None:

@@ -61,6 +61,10 @@ class WorldUnit:
         shift = matrix[..., :3, 3] * self.unit - matrix[..., :3, :3] @ self.center.double()
         return _with_translation(camera, shift)
 
+    def points_outside(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Points of the map's world in the photographs'."""
+        return (points.double() * self.unit + self.center.double()).to(points.dtype)
+
 
 def _with_translation(camera: Camera, translation: Float[Tensor, "*b 3"]) -> Camera:
     matrix = camera.world_to_cam.clone()

@@ -68,7 +68,7 @@ def write_completed(
         cloud_of(done.known, votes=config.complete.confidence.votes, subdivide=SUBDIVIDE),
         config.complete.confidence.least_confidence,
     )
-    outside = _outside(cloud, done.unit)
+    outside = replace(cloud, points=done.unit.points_outside(cloud.points))
     write_cloud(outside, folder / "cloud.ply")
     write_views(done.known, done.unit, folder)
     write_colmap(done.known, done.unit, outside, folder)
@@ -121,12 +121,6 @@ def _count(known: GlobalMap, kind: str) -> int:
 
 def _sure(cloud: PointCloud, least: float) -> PointCloud:
     return cloud[cloud.confidence >= least]
-
-
-def _outside(cloud: PointCloud, unit: WorldUnit) -> PointCloud:
-    """In the photographs' world."""
-    points = cloud.points.double() * unit.unit + unit.center.double()
-    return replace(cloud, points=points.float())
 
 
 def _metrics(done: Completed, cloud: PointCloud) -> dict[str, dict[str, float]] | None:

@@ -232,6 +232,11 @@ def test_a_method_with_a_wrong_option_is_named(own: Path, copy: Path) -> None:
         run_greys(own, copy, "options.dark.levle=0.3")
 
 
+def test_two_names_of_one_method_are_no_two_rows(own: Path, copy: Path) -> None:
+    with pytest.raises(InputError, match=r"methods dark and light are the same.*leave one out"):
+        run_greys(own, copy, "options.light.level=0.2")
+
+
 def test_means_hold_their_interval(finished: Path) -> None:
     means = read_results(greys_folder(finished)).means()
     assert (

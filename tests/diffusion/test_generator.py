@@ -41,6 +41,17 @@ def test_queries_do_not_depend_on_each_other(config: ModelConfig) -> None:
     torch.testing.assert_close(alone.images[0], together.images[2], atol=1e-5, rtol=0)
 
 
+def test_fewer_references_than_the_models_may_be_asked_for(config: ModelConfig) -> None:
+    views = _views(ring(torch.tensor([0.0, 40.0, 80.0]).numpy()))
+    queries = ring(torch.tensor([10.0, 75.0]).numpy())
+    assert config.references == 3
+    one = replace(_generator(config, 8), references=1).generate(views, queries, ["a", "b"])
+    assert one.references == [(0,), (2,)]
+    all_three = _generator(config, 8).generate(views, queries, ["a", "b"])
+    assert [len(row) for row in all_three.references] == [3, 3]
+    assert one.warp.mask.sum() < all_three.warp.mask.sum()
+
+
 def test_seed_and_name_choose_the_noise(config: ModelConfig) -> None:
     generator = _generator(config, 8)
     views, query = _views(ring(torch.tensor([0.0, 40.0]).numpy())), ring(torch.ones(1).numpy())

@@ -110,6 +110,8 @@ def test_unit_and_origin_of_the_world_do_not_matter(unit):
             views[0].camera.center,
             atol=1e-4,
         )
+        points = world.points_outside(inside[0].camera.center[None])
+        assert torch.allclose(points[0], back.center, rtol=1e-4)
     for one, other in zip(*found, strict=True):
         assert torch.allclose(one.depth, other.depth, rtol=1e-4)
         assert torch.allclose(one.camera.world_to_cam, other.camera.world_to_cam, atol=1e-5)
