@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 from lightning.fabric import Fabric
-from lightning.fabric.plugins.environments import LightningEnvironment
+from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 
 from benchmarks.methods.base import SceneInputs
 from benchmarks.methods.diffusion import Diffusion, Painted
