@@ -126,6 +126,42 @@ def test_an_average_of_another_length_is_a_model_with_its_own_scores(
     assert "train with trainer.power_averages=true" in _said(tmp_path / "copy")
 
 
+def test_a_finished_run_is_measured_again_sampled_otherwise(
+    undisturbed: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(undisturbed, tmp_path / "copy", symlinks=True)
+    run = _run_folder(tmp_path / "copy")
+    before = (run / "summary.json").read_bytes()
+    _finish(tmp_path / "copy", "task=validate")
+    _finish(tmp_path / "copy", "task=validate", "sampler.steps=1")
+    found = [json.loads(file.read_text()) for file in run.glob("validations/*/summary.json")]
+    scores = [summary["validation"] for summary in found]
+    own = json.loads(before)["validation"]
+    assert len(scores) == 2
+    assert [score["model"] == own["model"] for score in scores].count(True) == 1
+    assert all(score["nearest"] == own["nearest"] for score in scores)
+    assert all(summary["steps"] == 12 for summary in found)
+    assert (run / "summary.json").read_bytes() == before
+
+
+def test_views_denoised_together_are_measured_as_the_same_views(
+    undisturbed: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(undisturbed, tmp_path / "copy", symlinks=True)
+    _finish(tmp_path / "copy", "run=together", "model.joint_views=2", "trainer.steps=3")
+    runs = [_run_folder(undisturbed), _run_folder(tmp_path / "copy")]
+    assert runs[1].name == "together"
+    alone, together = (
+        pd.read_csv(run / "validation.csv").set_index(["method", "view"]).sort_index()
+        for run in runs
+    )
+    assert list(alone.index) == list(together.index)
+    baselines = alone.index.get_level_values("method") != "model"
+    pd.testing.assert_frame_equal(alone[baselines], together[baselines])
+    unets = [load_file(run / "model/unet/diffusion_pytorch_model.safetensors") for run in runs]
+    assert {k: v.shape for k, v in unets[0].items()} == {k: v.shape for k, v in unets[1].items()}
+
+
 def test_killed_at_any_moment_the_weights_are_the_same(undisturbed: Path, tmp_path: Path) -> None:
     """SIGKILL during preparation, between checkpoints and right after the last; then run to the
     end.
