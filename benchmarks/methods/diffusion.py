@@ -14,9 +14,10 @@ from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis, Unavailab
 from benchmarks.methods.gaussians.checks import check_range
 from benchmarks.methods.references import views_with_depth
 from extrap_train.config import SamplerConfig
-from extrap_train.diffusion.checkpoint import load_model, packaged_weights
+from extrap_train.diffusion.checkpoint import load_model
 from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.packaged import packaged_name, packaged_weights
 from extrap_train.errors import InputError
 
 
@@ -102,8 +103,9 @@ class Diffusion:
         return DiffusionGenerator(model, self.sampler, references=self.references)
 
     def _folder(self, category: str) -> Path:
-        default = f"{self.family}-{category}" if self.family == "ours" else self.family
-        name = (self.weights or default).replace("{category}", category)
+        name = (self.weights or packaged_name(self.family, category)).replace(
+            "{category}", category
+        )
         if self.weights is not None and Path(name).is_dir():
             return Path(name)
         try:

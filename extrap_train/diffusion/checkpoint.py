@@ -17,12 +17,12 @@ from extrap_train.data.files import partial_beside, write_whole
 from extrap_train.diffusion.autoencoder import PixelPatches
 from extrap_train.diffusion.compact import compress, restore
 from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.packaged import MODEL_CONFIG, packaged_weights
 from extrap_train.diffusion.published.read import SOURCES, Shapes, read_published, weights_at
 from extrap_train.diffusion.transfer import narrowed, turned_pose, widened
 from extrap_train.errors import InputError
 from extrap_train.weight_files import WeightFile
 
-_CONFIG = "extrapolation_model.json"
 _PUBLISHED_CHANNELS = {8: "zeronvs", 11: "megascenes"}
 _COMPACT = "difference.safetensors"
 _DIFFUSERS_NAME = "diffusion_pytorch_model.safetensors"
@@ -32,18 +32,6 @@ _FILES = {
     "image_encoder": "model.safetensors",
     "cc_projection": "model.safetensors",
 }
-
-
-def packaged_weights(name: str, option: str = "model.start") -> Path:
-    """Folder of a model that comes with the package; InputError names those that do."""
-    folder = Path(__file__).parents[1] / "weights"
-    if not (folder / name / _CONFIG).is_file():
-        known = sorted(path.parent.name for path in folder.glob(f"*/{_CONFIG}"))
-        raise InputError(
-            f"{option}={name} is neither a file or folder of weights nor one of the package's: "
-            f"{', '.join(known)}"
-        )
-    return folder / name
 
 
 def save_model(model: ExtrapolationModel, folder: Path, dtype: torch.dtype = torch.float32) -> None:
@@ -133,7 +121,7 @@ def _digest(folder: Path) -> str:
 
 
 def _write_config(model: ExtrapolationModel, folder: Path) -> None:
-    write_whole(folder / _CONFIG, (json.dumps(asdict(model.config), indent=1) + "\n").encode())
+    write_whole(folder / MODEL_CONFIG, (json.dumps(asdict(model.config), indent=1) + "\n").encode())
 
 
 def _save(tensors: dict[str, Tensor], path: Path, about: Mapping[str, str] | None = None) -> None:
@@ -157,13 +145,13 @@ def load_model(folder: Path) -> ExtrapolationModel:
 def _saved_config(folder: Path) -> ModelConfig:
     inner = {"unet": UNetConfig, "vae": VaeConfig, "clip": ClipConfig}
     try:
-        saved = json.loads((folder / _CONFIG).read_text())
+        saved = json.loads((folder / MODEL_CONFIG).read_text())
         for name, kind in inner.items():
             if saved.get(name) is not None:
                 saved[name] = kind(**saved[name])
         return ModelConfig(**saved)
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError(f"{folder / _CONFIG}: no model of this project ({error})") from None
+        raise InputError(f"{folder / MODEL_CONFIG}: no model of this project ({error})") from None
 
 
 def load_weights(model: ExtrapolationModel, path: Path) -> None:
@@ -190,7 +178,7 @@ def load_weights(model: ExtrapolationModel, path: Path) -> None:
 
 
 def _family(path: Path, file: WeightFile, conv_in: Tensor) -> str:
-    if (path / _CONFIG).is_file():
+    if (path / MODEL_CONFIG).is_file():
         return _saved_config(path).family
     channels = conv_in.shape[1]
     if channels not in _PUBLISHED_CHANNELS:

@@ -6,9 +6,11 @@ import torch
 from rich.console import Console
 
 from extrap_train.config import TrainConfig
-from extrap_train.diffusion.checkpoint import load_model, packaged_weights, save_compact
+from extrap_train.diffusion.checkpoint import load_model, save_compact
 from extrap_train.diffusion.model import ExtrapolationModel
-from extrap_train.tasks.scene_inputs import trained_model
+from extrap_train.diffusion.packaged import packaged_name, packaged_weights
+from extrap_train.runs import existing_run
+from extrap_train.tasks.scene_inputs import open_model
 
 _BASE = "base"
 
@@ -16,8 +18,9 @@ _BASE = "base"
 def run(config: TrainConfig) -> None:
     """Write the newest (or `weights`) model under the name that the package gives it."""
     console = Console()
-    model = trained_model(config)
-    folder = Path(config.output) / "packed" / packaged_name(model, config.category.name)
+    model = open_model(config.weights or str(existing_run(config).model), config.adapter)
+    name = packaged_name(model.config.family, config.category.name)
+    folder = Path(config.output) / "packed" / name
     folder.parent.mkdir(parents=True, exist_ok=True)
     save_compact(model, folder, _BASE)
     size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
@@ -26,12 +29,6 @@ def run(config: TrainConfig) -> None:
         f"{size / 1e6:.1f} MB; of the training's movement away from {_BASE}, {lost:.1%} is lost"
     )
     console.print(f"result: {folder}")
-
-
-def packaged_name(model: ExtrapolationModel, category: str) -> str:
-    """`ours-hydrant`; the published families are of no category: `zeronvs`, `megascenes`."""
-    family = model.config.family
-    return f"{family}-{category}" if family == "ours" else family
 
 
 def _lost_share(

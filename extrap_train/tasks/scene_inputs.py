@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from lightning.fabric import Fabric
+from rich.console import Console
 
 from data_prep.views import choose_frames, input_views
 from extrap_train.config import SyntheticConfig, TrainConfig
@@ -12,9 +13,10 @@ from extrap_train.data.photographs import CATEGORY
 from extrap_train.data.scene import open_scene
 from extrap_train.data.sequences import Frame, Sequence
 from extrap_train.depth.build import depth_source
-from extrap_train.diffusion.checkpoint import load_model, packaged_weights
+from extrap_train.diffusion.checkpoint import load_model
 from extrap_train.diffusion.lora import load_adapter
 from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.packaged import packaged_name, packaged_names, packaged_weights
 from extrap_train.errors import InputError
 from extrap_train.runs import newest_run
 from extrap_train.views import View
@@ -60,16 +62,30 @@ def open_inputs(config: TrainConfig, image_size: int) -> SceneInputs:
 
 
 def trained_model(config: TrainConfig) -> ExtrapolationModel:
-    """The model that `weights` names, by default the category's newest, with its adapter if any."""
+    """The model that `weights` names, with its adapter if any; by default the category's newest.
+
+    Before there is a run, the packaged model of the category takes its place, which is said.
+    """
     if config.weights is not None:
         return open_model(config.weights, config.adapter)
     newest = newest_run(config).model
-    if not newest.is_dir():
-        raise InputError(
-            f"{newest}: there is no trained model of {config.category.name}; train one "
-            "(task=category), or give weights=FOLDER, or weights=base for the packaged model"
-        )
-    return open_model(str(newest), config.adapter)
+    if newest.is_dir():
+        return open_model(str(newest), config.adapter)
+    name = _packaged(config)
+    Console(stderr=True).print(f"{newest}: there is none yet; weights={name}, of the package")
+    return open_model(name, config.adapter)
+
+
+def _packaged(config: TrainConfig) -> str:
+    """The packaged model of this configuration; InputError where there is none."""
+    name = packaged_name(config.model.family, config.category.name)
+    if config.model.name.startswith("small") and name in packaged_names():
+        return name
+    raise InputError(
+        f"{newest_run(config).model}: there is no trained model of {config.category.name}; train "
+        "one (task=category), or give weights=FOLDER or a packaged model's name: "
+        f"{', '.join(packaged_names())}"
+    )
 
 
 def open_model(weights: str, adapter: str | None = None) -> ExtrapolationModel:

@@ -12,7 +12,8 @@ from extrap_train.config import (
     SyntheticConfig,
     TrainConfig,
 )
-from extrap_train.diffusion.checkpoint import load_model, packaged_weights
+from extrap_train.diffusion.checkpoint import load_model
+from extrap_train.diffusion.packaged import packaged_weights
 from extrap_train.tasks.pack import run
 
 

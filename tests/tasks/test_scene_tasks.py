@@ -114,13 +114,24 @@ def test_an_adapter_is_made_used_again_and_put_upon_the_weights(
     command("task=view", f"weights={weights}", adapter, "pose=frame000003")
 
 
+def test_before_a_run_the_category_s_packaged_model_paints_and_says_so(
+    command, tmp_path, capsys
+) -> None:
+    command("task=view", "pose=frame000003")
+    assert "weights=ours-hydrant, of the package" in " ".join(capsys.readouterr().err.split())
+    assert Image.open(tmp_path / "view" / "hydrant-0000" / "truth.png").size == (64, 64)
+
+
 def test_what_cannot_be_used_is_one_line(command, weights, tmp_path) -> None:
     given = f"weights={weights}"
     one = ["task=scene", given, "inputs=1"]
     assert "has 1 input view, and pairs need at least two" in _refused(command, *one)
     assert "give scene=FOLDER" in _refused(command, "task=scene", given, "scene=null")
-    assert "there is no trained model of hydrant" in _refused(command, "task=scene")
-    assert "nor one of the package's: base" in _refused(command, "task=scene", "weights=bse")
+    another = _refused(command, "task=scene", "model.name=mine")
+    assert "there is no trained model of hydrant; train one (task=category)" in another
+    assert "nor one of the package's: base, megascenes, ours-apple" in _refused(
+        command, "task=scene", "weights=bse"
+    )
     view = ["task=view", given]
     assert "a pose=FRAME|FILE.json or an orbit=DEGREES" in _refused(command, *view)
     assert "neither a frame of the scene nor" in _refused(command, *view, "pose=frame99")
