@@ -29,5 +29,5 @@ def test_each_is_a_model_of_its_family(name: str) -> None:
 
 
 def test_an_unknown_name_lists_the_known() -> None:
-    with pytest.raises(InputError, match="model.start=cup is neither .*: base, megascenes, ours-ap"):
+    with pytest.raises(InputError, match=r"=cup is neither .*: base, megascenes, ours-ap"):
         packaged_weights("cup")
