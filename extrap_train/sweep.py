@@ -27,6 +27,7 @@ from extrap_train.sweep_seeds import over_seeds
 
 Row = dict[str, str]
 METRIC = "result."
+_ONLY = "every job"
 """Before the names of metrics, which could be those of options."""
 _HEAD, _LAST = ("job", "status", "seconds"), "reason"
 _NO_METRICS = ("provenance", "seconds", "asked")
@@ -186,17 +187,24 @@ def draw(rows: list[Row], file: Path) -> None:
 
 
 def compare_over_seeds(rows: list[Row], file: Path) -> None:
-    """The table of `over_seeds`, once a combination of overrides has run with two seeds."""
-    done = [row for row in rows if row["status"] == "ok" and "seed" in row]
+    """The table of `over_seeds`, once a combination of overrides has run with two seeds.
+
+    The first job's is what the others are compared with, also where it has failed.
+    """
+    rows = [row for row in rows if "seed" in row]
+    if not rows:
+        return
+    done = [row for row in rows if row["status"] == "ok"]
     metrics = _shown_metrics(done)
-    alike = [{**row, "seed": ""} for row in done]
-    labels = [_label(row, alike) or "every job" for row in alike]
+    alike = [{**row, "seed": ""} for row in rows]
+    first = _label(alike[0], alike) or _ONLY
+    labels = [_label(row, alike) or _ONLY for row in alike if row["status"] == "ok"]
     if len(set(labels)) == len(labels) or not metrics:
         return
     columns = {
         m.removeprefix(METRIC): [float(row.get(m, math.nan)) for row in done] for m in metrics
     }
-    write_whole(file, over_seeds(labels, [row["seed"] for row in done], columns).encode())
+    write_whole(file, over_seeds(first, labels, [row["seed"] for row in done], columns).encode())
 
 
 def _shown_metrics(rows: list[Row]) -> list[str]:

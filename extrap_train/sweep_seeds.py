@@ -6,17 +6,21 @@ from collections.abc import Mapping, Sequence
 
 
 def over_seeds(
-    labels: Sequence[str], seeds: Sequence[str], metrics: Mapping[str, Sequence[float]]
+    first: str,
+    labels: Sequence[str],
+    seeds: Sequence[str],
+    metrics: Mapping[str, Sequence[float]],
 ) -> str:
     """A Markdown table with a row a label, of jobs given by their label, seed and metrics.
 
-    Differences are taken seed by seed to the first label's jobs, so that what a seed does to all
-    alike drops out; ± is the standard error of the mean over seeds, absent where there is but one.
+    Differences are taken seed by seed to the jobs labelled `first`, so that what a seed does to all
+    alike drops out, and there are none where these are missing; ± is the standard error of the mean
+    over seeds, absent where there is but one.
     """
-    jobs: dict[str, dict[str, int]] = {}
+    jobs: dict[str, dict[str, int]] = {first: {}}
     for place, (label, seed) in enumerate(zip(labels, seeds, strict=True)):
         jobs.setdefault(label, {})[seed] = place
-    reference = next(iter(jobs.values()))
+    reference = jobs[first]
     head = ["", "seeds"]
     for metric in metrics:
         head += [metric, "difference"]

@@ -12,7 +12,7 @@ import yaml
 from extrap_train.__main__ import main
 from extrap_train.config import TrainConfig
 from extrap_train.errors import InputError
-from extrap_train.sweep import add_row, read_rows
+from extrap_train.sweep import add_row, compare_over_seeds, read_rows
 from extrap_train.sweep_seeds import over_seeds
 
 Fake = Callable[[TrainConfig], Path]
@@ -84,7 +84,7 @@ def test_seeds_are_compared_one_by_one() -> None:
     seeds = ["0", "1", "2", "1", "0", "7"]
     psnr = [20.0, 22.0, 27.0, 22.5, 20.3, 19.0]
     lpips = [0.1, 0.2, float("nan"), 0.3, 0.2, float("nan")]
-    table = over_seeds(labels, seeds, {"psnr": psnr, "lpips": lpips})
+    table = over_seeds("old", labels, seeds, {"psnr": psnr, "lpips": lpips})
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()]
     assert rows[0] == ["", "seeds", "psnr", "difference", "lpips", "difference"]
     assert rows[2] == ["old", "3", "23.00 ± 2.08", "", "0.1500 ± 0.0500", ""]
@@ -162,3 +162,27 @@ def test_an_objective_that_is_not_measured_is_named(
     assert said is not None
     assert "no such metric; did you mean validation.model.psnr" in said
     assert pd.read_csv(tmp_path / "sweep.csv")["status"][0] == "failed"
+
+
+def test_what_others_are_compared_with_does_not_change_where_it_fails(tmp_path: Path) -> None:
+    """Without the first combination there is no difference to show, least of all to the second."""
+    rows = [
+        {"job": str(job), "status": status, "seconds": "1", "model": model, "seed": seed, **found}
+        for job, (model, seed, status, found) in enumerate(
+            [
+                ("plain", "0", "failed", {}),
+                ("plain", "1", "failed", {}),
+                ("new", "0", "ok", {"result.psnr": "20.0"}),
+                ("new", "1", "ok", {"result.psnr": "21.0"}),
+                ("newer", "0", "ok", {"result.psnr": "25.0"}),
+            ]
+        )
+    ]
+    compare_over_seeds(rows, tmp_path / "seeds.md")
+    lines = (tmp_path / "seeds.md").read_text().splitlines()[2:]
+    table = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
+    assert table == [
+        ["model=plain", "0", "–", ""],
+        ["model=new", "2", "20.50 ± 0.50", "–"],
+        ["model=newer", "1", "25.00", "–"],
+    ]
