@@ -28,7 +28,7 @@ def code_hash(modules: Iterable[str]) -> str:
         source = _source(name)
         if source is not None:
             found[name] = source
-            waiting += [*_imports(source), *_parents(name)]
+            waiting += [*_imports(source, _package(name, source)), *_parents(name)]
     digest = hashlib.sha256()
     for name in sorted(found):
         digest.update(f"{name}\0".encode())
@@ -67,18 +67,25 @@ def _source(module: str) -> Path | None:
     return Path(spec.origin)
 
 
+def _package(module: str, source: Path) -> str:
+    """What a module's relative imports are relative to."""
+    return module if source.name == "__init__.py" else module.rpartition(".")[0]
+
+
 @lru_cache(4096)
-def _imports(source: Path) -> tuple[str, ...]:
-    return tuple(_imported(ast.parse(source.read_bytes())))
+def _imports(source: Path, package: str) -> tuple[str, ...]:
+    return tuple(_imported(ast.parse(source.read_bytes()), package))
 
 
-def _imported(tree: ast.Module) -> Iterator[str]:
+def _imported(tree: ast.Module, package: str) -> Iterator[str]:
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
-            yield node.module
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            name = "." * node.level + (node.module or "")
+            module = importlib.util.resolve_name(name, package)
+            yield module
+            yield from (f"{module}.{alias.name}" for alias in node.names)
 
 
 def _parents(module: str) -> list[str]:
