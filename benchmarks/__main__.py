@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from benchmarks.catalogue import Catalogue
+from benchmarks.table_checks import check_table
 from extrap_train.config import CATEGORIES
 from extrap_train.errors import InputError
 
@@ -129,8 +130,7 @@ def _description(catalogue: Catalogue, kind: str, name: str) -> str:
 def _run(options: argparse.Namespace) -> int:
     catalogue = Catalogue.with_own(options.config_dir)
     table = catalogue.table(options.table, options.overrides)
-    for name in table.methods:
-        catalogue.method(name)  # a typing error is told before anything heavy loads
+    check_table(table, catalogue)  # a typing error is told before anything heavy loads
     from benchmarks.runner import RunOptions, run_table
 
     run = RunOptions(options.quick, options.dry_run, options.workers, options.slurm)

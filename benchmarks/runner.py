@@ -220,8 +220,9 @@ def _print_plan(
         rate = f"{seconds:.1f}" if seconds is not None else "not yet known"
         shown.add_row(name, str(len(mine)), str(len(still)), rate, missing)
     console.print(shown)
-    more = f", and what {', '.join(unknown)} take" if unknown else ""
-    console.print(f"about {_duration(total)} of one core{more}")
+    known = [f"about {_duration(total)} of one core"] if total or not unknown else []
+    more = [f"no finished cell tells how long {', '.join(unknown)} will take"] if unknown else []
+    console.print("; ".join([*known, *more]))
 
 
 def _seconds_by_method(folder: TableFolder) -> dict[str, list[float]]:

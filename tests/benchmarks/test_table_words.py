@@ -4,9 +4,11 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import table_checks
 from benchmarks.__main__ import main
 from benchmarks.catalogue import Catalogue
 from benchmarks.results import read_results
+from benchmarks.scenes import DEPTHS
 from extrap_train.errors import InputError
 from tests.benchmarks.tables import greys_folder, run_greys, write_own
 
@@ -36,6 +38,14 @@ def test_read_only_output_is_one_line(own: Path, tmp_path: Path) -> None:
             ["run", "table1", "rules.veiws=[3]"],
             "there is no option rules.veiws; did you mean rules.views",
         ),
+        (["run", "table1", "captures.source=c3d"], "captures.source: 'c3d' is unknown; did you"),
+        (["run", "table1", "draws=[sprd]"], "draws: 'sprd' is unknown; did you mean spread?"),
+        (["run", "table1", "rules.draws=[all]"], "rules.draws: 'all' is unknown; known:"),
+        (["run", "table1", "rules.depth=stereoo"], "rules.depth: 'stereoo' is unknown; did you"),
+        (["run", "table1", "rules.views=[3,9]"], "rules.views: 9 of 9 frames as inputs leave no"),
+        (["run", "table1", "scoring.lpips=[alx]"], "scoring.lpips: 'alx' is unknown; did you"),
+        (["run", "table1", "columns=[psnrr]"], "columns: 'psnrr' is unknown; did you mean psnr"),
+        (["run", "table1", "options.our.steps=3"], "options: 'our' is unknown; did you mean ours"),
         (["run", "table1", "rules.pool=many"], "could not be converted to Integer"),
         (["run", "table1", "--config-dir", "/nowhere"], "/nowhere: no such folder"),
         (["report", "table1", "output=/nowhere"], "holds no results"),
@@ -54,10 +64,12 @@ def test_a_wrong_word_is_one_line(
 
 def test_every_table_of_the_package_is_sound() -> None:
     """Its methods exist, its columns are metrics, its published numbers are complete."""
+    assert tuple(DEPTHS) == table_checks.DEPTHS
     catalogue = Catalogue.with_own()
     for name in catalogue.names("table"):
         table = catalogue.table(name)
         assert table.methods
+        table_checks.check_table(table, catalogue)
         for method in table.methods:
             assert catalogue.method(method).factory
         nets = {f"lpips_{net}" for net in table.scoring.lpips}
