@@ -10,6 +10,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from benchmarks.cells import OK, read_cell
+from benchmarks.columns import direction
 from benchmarks.plan import TableFolder
 from benchmarks.scenes import Scene
 from extrap_train.data.json_files import read_json
@@ -23,18 +24,8 @@ TIDY = [
 ]  # fmt: skip
 UNIT = ["category", "sequence", "draw", "seed"]
 """What a paired comparison pairs by."""
-HIGHER_IS_BETTER = {
-    "psnr", "ssim", "masked_psnr", "masked_ssim", "unseen_psnr", "unseen_ssim", "compat_psnr",
-    "compat_ssim", "tsed", "warp_psnr", "completeness", "accuracy_share", "f_score",
-}  # fmt: skip
-LOWER_IS_BETTER = {"dists", "seconds", "peak_memory_mib", "accuracy_distance"}
-
-
-def direction(metric: str) -> int:
-    """1 where higher is better, -1 where lower is, 0 where neither (a property of the draw)."""
-    if metric in HIGHER_IS_BETTER:
-        return 1
-    return -1 if metric in LOWER_IS_BETTER or metric.startswith("lpips") else 0
+CAPTURE = ["category", "sequence"]
+"""What is drawn anew in a bootstrap: draws and seeds of one capture are no independent samples."""
 
 
 @dataclass(frozen=True)
@@ -92,8 +83,9 @@ class Results:
         return pd.DataFrame(rows, columns=columns)
 
     def means(self, category: str | None = None) -> pd.DataFrame:
-        """A row a method, draw, number of views and metric: mean, interval over captures, count,
-        the best's mark, and whether the best is better beyond chance (paired).
+        """A row a method, draw, number of views and metric: mean, interval over captures, the count
+        of cells and of those that any method has, rank, and whether the best is better beyond
+        chance (paired). A method that lacks cells has no rank: its mean is of other captures.
         """
         table = self.tidy[self.tidy["metric"] != ""].dropna(subset=["value"])
         if category is not None:
@@ -101,17 +93,21 @@ class Results:
         rows: list[dict[str, Any]] = []
         for (draw, n_views, metric), part in table.groupby(["draw", "n_views", "metric"]):
             rows += _ranked(part, {"draw": draw, "n_views": n_views, "metric": metric})
-        columns = ["method", "draw", "n_views", "metric", "mean", "low", "high", "cells", "rank"]
-        return pd.DataFrame(rows, columns=[*columns, "behind_best"])
+        columns = ["method", "draw", "n_views", "metric", "mean", "low", "high", "cells", "of"]
+        return pd.DataFrame(rows, columns=[*columns, "rank", "behind_best"])
 
 
 def read_results(folder: TableFolder) -> Results:
-    """The cells that the last run planned; raises InputError where none was, or where a cell is of
-    another protocol. A cell that is missing or damaged counts as failed.
+    """The cells that the last run planned, without those that are missing.
+
+    Raises InputError where no run was, where its plan or a cell is damaged, and where a cell is of
+    another protocol.
     """
     if not folder.plan.is_file():
         raise InputError(f"{folder.path}: holds no results; `benchmark run` makes them")
     plan = read_json(folder.plan)
+    if not isinstance(plan, dict) or not {"table", "protocol", "methods", "cells"} <= plan.keys():
+        raise InputError(f"{folder.plan}: is no table's plan; run the table again")
     cells = []
     for key in plan["cells"]:
         cell = read_cell(folder.cells / key)
@@ -131,28 +127,38 @@ def _ranked(part: pd.DataFrame, head: dict[str, Any]) -> list[dict[str, Any]]:
     """Means of one column, with ranks and paired differences to the best."""
     values = part.pivot_table(index=UNIT, columns="method", values="value", sort=False)
     sign = direction(head["metric"])
-    means = values.mean()
-    ranks = (-sign * means).rank(method="min") if sign else pd.Series(np.nan, index=means.index)
-    best = ranks.idxmin() if sign else None
+    means = by_capture(values).mean()
+    complete = values.notna().all()
+    ranks = (-sign * means[complete]).rank(method="min").reindex(means.index)
+    best = ranks.idxmin() if sign and complete.any() else None
     rows = []
     for method in values.columns:
-        own = values[method].dropna().to_numpy()
+        own = by_capture(values[method].dropna()).to_numpy()
         low, high = interval(own, seed_of(str(method), *map(str, head.values())))
         row = {"method": method, **head, "mean": own.mean(), "low": low, "high": high}
+        counts = {"cells": int(values[method].count()), "of": len(values)}
         behind = method != best and best is not None and is_behind(values, str(best), str(method))
-        rows.append({**row, "cells": len(own), "rank": ranks[method], "behind_best": behind})
+        rank = ranks[method] if sign else np.nan
+        rows.append({**row, **counts, "rank": rank, "behind_best": behind})
     return rows
 
 
-def is_behind(values: pd.DataFrame, best: str, other: str) -> bool:
-    """Whether the paired difference's interval leaves out zero, over the captures that have both.
+def by_capture(values: Any) -> Any:
+    """Means over the draws and seeds of every capture, of numbers that `UNIT` is the index of."""
+    return values.groupby(level=CAPTURE, sort=False).mean()
 
-    A single pair tells nothing.
+
+def is_behind(values: pd.DataFrame, best: str, other: str) -> bool:
+    """Whether the interval of the paired difference over captures leaves out zero, of the cells
+    that both have; the frame's index is `UNIT`.
+
+    A single capture tells nothing.
     """
     both = values[[best, other]].dropna()
-    if len(both) < 2:
+    difference = by_capture(both[best] - both[other]).to_numpy()
+    if len(difference) < 2:
         return False
-    low, high = interval((both[best] - both[other]).to_numpy(), seed_of(best, other))
+    low, high = interval(difference, seed_of(best, other))
     return bool(low > 0 or high < 0)
 
 

@@ -1,12 +1,14 @@
 """What a printed table shows, before it is Markdown, LaTeX or HTML."""
 
+from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
 import pandas as pd
 
 from benchmarks.cells import OK
-from benchmarks.results import Results, direction
+from benchmarks.columns import direction
+from benchmarks.results import Results
 
 NAMES = {
     "lpips_alex": "LPIPS (alex)",
@@ -135,8 +137,9 @@ def _entry(mean: Any, metric: str) -> Entry:
         return Entry("–", None, title="no number: see below")
     rank = None if pd.isna(mean.rank) else int(mean.rank)
     low, high = (_number(v, metric) for v in (mean.low, mean.high))
+    lacking = f" ({mean.cells}/{mean.of})" if mean.cells < mean.of else ""
     return Entry(
-        text=_number(mean.mean, metric),
+        text=_number(mean.mean, metric) + lacking,
         value=float(mean.mean),
         rank=rank,
         ties_best=rank is not None and rank > 1 and not mean.behind_best,
@@ -200,7 +203,8 @@ def _notes(results: Results) -> list[str]:
         f"{rules['image_size']} × {rules['image_size']} px, depth of the inputs: {rules['depth']}. "
         f"Device: {', '.join(devices)}.",
         "Best bold, second underlined; ° marks what cannot be told from the best (the 95 % "
-        "bootstrap interval of the paired differences over captures holds zero).",
+        "bootstrap interval of the paired differences over captures holds zero). A mean that lacks "
+        "cells says how many it has of how many, and is not ranked.",
         "Time: " + "; ".join(f"{title}: {meaning}" for title, meaning in times.items()) + ".",
         *_given(results),
     ]
@@ -208,9 +212,20 @@ def _notes(results: Results) -> list[str]:
 
 def _given(results: Results) -> list[str]:
     """What each method used, for the reader who wants to know whether the race was fair."""
-    lines = {}
+    used: dict[str, dict[str, Counter[str]]] = {}
     for cell in results.cells:
-        if cell["status"] == OK and cell["given"]:
-            used = ", ".join(f"{name}: {value}" for name, value in cell["given"].items())
-            lines[cell["method"]] = f"{cell['method']} — {used}"
-    return ["Given: " + "; ".join(lines.values()) + "."] if lines else []
+        if cell["status"] == OK:
+            for name, value in cell["given"].items():
+                used.setdefault(cell["method"], {}).setdefault(name, Counter())[value] += 1
+    lines = [
+        f"{method} — {', '.join(f'{name}: {_counted(values)}' for name, values in words.items())}"
+        for method, words in used.items()
+    ]
+    return ["Given: " + "; ".join(lines) + "."] if lines else []
+
+
+def _counted(values: Counter[str]) -> str:
+    """With the number of cells where they are not all alike."""
+    if len(values) == 1:
+        return next(iter(values))
+    return " / ".join(f"{value} ({count} cells)" for value, count in sorted(values.items()))
