@@ -1,7 +1,7 @@
 """From a table to its cells: protocol, prepared draws, and what each cell is named by."""
 
 import inspect
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from extrap_train.errors import InputError
 
 KEY_LENGTH = 20
 """Hexadecimal digits of a cell's key."""
+_IMAGES = ("method", "code", "weights", "data", "device", "rules")
 
 
 @dataclass(frozen=True)
@@ -78,11 +79,12 @@ class Selection:
 def open_protocol(table: TableConfig, folder: TableFolder) -> tuple[Protocol, list[Capture]]:
     """The table's frozen protocol, made now if there is none yet, and its captures.
 
-    Raises InputError where the folder holds results of another protocol.
+    One without any result is made anew. Raises InputError where the folder holds results of another
+    protocol.
     """
     captures = open_captures(table.captures, table.captures.categories)
     fresh = freeze(table.captures, table.rules, captures)
-    if not folder.protocol.is_file():
+    if not folder.protocol.is_file() or not any(folder.cells.glob("*/cell.json")):
         fresh.write(folder.protocol)
         return fresh, captures
     frozen = Protocol.read(folder.protocol)
@@ -142,9 +144,8 @@ def cell_jobs(
                 "device": device,
             }
             hashes["rules"] = digest(asdict(protocol.rules))
-            images = digest(hashes)
-            hashes |= {"images": images, "scoring": scoring}
-            key = digest([images, scoring])[:KEY_LENGTH]
+            hashes |= {"images": images_hash(hashes), "scoring": scoring}
+            key = cell_key(hashes)
             jobs.append(
                 CellJob(
                     folder=folder.cells / key,
@@ -156,6 +157,16 @@ def cell_jobs(
                 )
             )
     return jobs
+
+
+def images_hash(hashes: Mapping[str, str]) -> str:
+    """Of all that decides a cell's images."""
+    return digest({name: hashes[name] for name in _IMAGES})
+
+
+def cell_key(hashes: Mapping[str, str]) -> str:
+    """A cell's name: of its images' hash and its scoring's."""
+    return digest([hashes["images"], hashes["scoring"]])[:KEY_LENGTH]
 
 
 def _require_different(methods: list[MethodConfig]) -> None:

@@ -7,7 +7,7 @@ from benchmarks.plan import TableFolder
 from benchmarks.report.layout import lay_out
 from benchmarks.report.page import page
 from benchmarks.report.plots import plots
-from benchmarks.report.text import latex, markdown
+from benchmarks.report.text import latex, markdown, tables
 from benchmarks.results import Results
 from extrap_train.data.files import write_whole
 
@@ -28,9 +28,7 @@ def write_reports(
     layout = lay_out(results, catalogue.reported(reported) if reported else None)
     contents: dict[str, bytes] = {}
     if "csv" in formats:
-        contents[f"{name}.csv"] = results.tidy.to_csv(index=False).encode()
-        contents[f"{name}_mean.csv"] = results.means().to_csv(index=False).encode()
-        contents[f"{name}_images.csv"] = results.by_image.to_csv(index=False).encode()
+        contents |= tables(results, name)
     if "md" in formats:
         contents[f"{name}.md"] = markdown(layout).encode()
     if "latex" in formats:

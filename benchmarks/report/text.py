@@ -1,8 +1,9 @@
-"""A laid-out table as Markdown and as LaTeX (booktabs)."""
+"""A table as CSV, and laid out as Markdown and as LaTeX (booktabs)."""
 
 from collections.abc import Callable
 
 from benchmarks.report.layout import Entry, Layout, Panel
+from benchmarks.results import Results
 
 _LATEX_SPECIAL = {
     "\\": r"\textbackslash{}",
@@ -22,6 +23,12 @@ _LATEX_SPECIAL = {
     "×": r"$\times$",
     "²": r"$^2$",
 }
+
+
+def tables(results: Results, name: str) -> dict[str, bytes]:
+    """The CSV files by name: every number, the means, and the numbers by image."""
+    frames = {"": results.tidy, "_mean": results.means(), "_images": results.by_image}
+    return {f"{name}{kind}.csv": f.to_csv(index=False).encode() for kind, f in frames.items()}
 
 
 def markdown(layout: Layout) -> str:

@@ -167,6 +167,37 @@ def test_verify_finds_a_forged_number_truth_and_protocol(copy: Path) -> None:
     assert any("not what its hash" in problem for problem in verify(folder)[1])
 
 
+def test_verify_finds_what_is_left_out_and_what_only_pictures_show(copy: Path) -> None:
+    folder = greys_folder(copy)
+    files = sorted(copy.glob("greys/cells/*/cell.json"))
+    records = [json.loads(file.read_text()) for file in files]
+    del records[0]["metrics"]["masked_psnr"]
+    records[1]["metrics"]["psnr"]["per_image"][0] += 1
+    records[2]["hashes"]["weights"] = "0" * 64
+    for file, record in zip(files, records, strict=True):
+        file.write_text(json.dumps(record))
+    table = folder.path / "greys_mean.csv"
+    table.write_text(table.read_text().replace("dark", "best"))
+    said = "\n".join(verify(folder)[1])
+    assert "masked_psnr is not stated, computed as" in said
+    assert "psnr by image is stated as" in said
+    assert "its name does not follow from the hashes" in said
+    assert "greys_mean.csv: is not what the cells say" in said
+
+
+def test_a_protocol_without_results_gives_way(own: Path, tmp_path: Path) -> None:
+    """A first command that was wrong does not spoil the folder for the right one."""
+    assert run_greys(own, tmp_path, "rules.image_size=16", dry_run=True) == 0
+    assert run_greys(own, tmp_path, quick=True) == 0
+    assert read_results(greys_folder(tmp_path)).plan["table"]["rules"]["image_size"] == 24
+
+
+def test_a_plan_that_is_none_is_one_line(copy: Path) -> None:
+    greys_folder(copy).plan.write_text("{}")
+    with pytest.raises(InputError, match=r"plan.json: is no table's plan"):
+        read_results(greys_folder(copy))
+
+
 def test_results_of_another_protocol_are_refused(own: Path, copy: Path) -> None:
     with pytest.raises(InputError, match=r"another protocol.*rules.image_size was 24, is 16"):
         run_greys(own, copy, "rules.image_size=16")
@@ -218,6 +249,21 @@ def test_compare_pairs_cells_and_tells_better_from_worse(
     assert row["low"] > 0
     assert row["difference"] == pytest.approx(row["after"] - row["before"])
     assert changed.loc[("light", "psnr")]["verdict"] == "the same"
+
+
+def test_compare_keeps_draws_apart_and_refuses_other_photographs(
+    own: Path, finished: Path, copy: Path, tmp_path: Path
+) -> None:
+    draws = "draws=[random,spread]"
+    assert run_greys(own, copy, draws, quick=True) == 0
+    same = compare(greys_folder(copy), greys_folder(copy)).query("metric == 'psnr'")
+    assert list(same["draw"]) == ["random", "random", "spread", "spread"]
+    assert list(same["captures"]) == [1, 1, 1, 1]
+    assert run_greys(own, tmp_path / "other", "captures.render_size=32", quick=True) == 0
+    with pytest.raises(
+        InputError, match=r"different photographs or cameras of apple-0000-3-random"
+    ):
+        compare(greys_folder(finished), greys_folder(tmp_path / "other"))
 
 
 def test_two_runs_on_one_folder_do_not_mix(own: Path, copy: Path) -> None:
