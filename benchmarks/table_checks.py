@@ -4,7 +4,14 @@ from collections.abc import Collection, Iterable
 
 from benchmarks.catalogue import Catalogue
 from benchmarks.columns import COLUMNS
-from extrap_train.config import CAPTURE_SOURCES, DRAWS, LPIPS_NETS, TableConfig
+from extrap_train.config import (
+    CAPTURE_SOURCES,
+    DRAWS,
+    LPIPS_NETS,
+    CapturesConfig,
+    SyntheticConfig,
+    TableConfig,
+)
 from extrap_train.errors import InputError, did_you_mean
 
 DEPTHS = ("dataset", "stereo")
@@ -23,6 +30,7 @@ def check_table(table: TableConfig, catalogue: Catalogue) -> None:
     _require_known("options", table.options, catalogue.names("method"))
     for name in table.methods:
         catalogue.method(name)
+    _require_held_out(table.captures)
     given = table.captures.source == "reconfusion"  # its files name the targets
     for n_views in rules.views:
         if n_views < 1 or (n_views >= rules.pool and not given):
@@ -30,6 +38,17 @@ def check_table(table: TableConfig, catalogue: Catalogue) -> None:
                 f"rules.views: {n_views} of {rules.pool} frames as inputs leave no target; give "
                 "from 1 to one less than rules.pool"
             )
+
+
+def _require_held_out(captures: CapturesConfig) -> None:
+    """Behind the rendered captures for testing follow those that models are trained on."""
+    usual = SyntheticConfig()
+    is_usual = captures.source == "synthetic" and captures.seed == usual.seed
+    if is_usual and captures.sequences > usual.test_sequences:
+        raise InputError(
+            f"captures.sequences={captures.sequences}: models are trained on the rendered captures "
+            f"behind the first {usual.test_sequences}; give fewer, or another captures.seed="
+        )
 
 
 def _require_known(option: str, words: Iterable[str], known: Collection[str]) -> None:

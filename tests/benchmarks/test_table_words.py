@@ -46,6 +46,7 @@ def test_read_only_output_is_one_line(own: Path, tmp_path: Path) -> None:
         (["run", "table1", "scoring.lpips=[alx]"], "scoring.lpips: 'alx' is unknown; did you"),
         (["run", "table1", "columns=[psnrr]"], "columns: 'psnrr' is unknown; did you mean psnr"),
         (["run", "table1", "options.our.steps=3"], "options: 'our' is unknown; did you mean ours"),
+        (["run", "table1", "captures.sequences=6"], "models are trained on the rendered captures"),
         (["run", "table1", "rules.pool=many"], "could not be converted to Integer"),
         (["run", "table1", "--config-dir", "/nowhere"], "/nowhere: no such folder"),
         (["report", "table1", "output=/nowhere"], "holds no results"),
