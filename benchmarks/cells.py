@@ -35,6 +35,8 @@ from extrap_train.errors import InputError
 from extrap_train.metrics import require_unit_range
 
 OK, FAILED, UNAVAILABLE = "ok", "failed", "unavailable"
+_DRAW = ("category", "sequence", "n_views", "draw", "seed")
+_MEASURED = ("seconds", "wall_seconds", "peak_memory_mib", "given", "counts")
 PER_IMAGE = "per image"
 """`MethodConfig.time` of the methods whose perform time is that of one image."""
 
@@ -60,6 +62,8 @@ class CellJob:
 def run_cell(job: CellJob) -> dict[str, Any]:
     """Make, score and write a cell; whatever goes wrong becomes its status, with the reason."""
     torch.set_num_threads(1)  # the same images, however many workers there are
+    if job.device != "cuda":  # before anything asks for a GPU: from then on it is there
+        os.environ["CUDA_VISIBLE_DEVICES"] = ""
     scene = Scene.open(job.scene)
     record = _head(job, scene)
     pictures: dict[str, bytes] = {}
@@ -106,12 +110,11 @@ def died_record(job: CellJob, reason: str) -> dict[str, Any]:
 
 def _head(job: CellJob, scene: Scene) -> dict[str, Any]:
     draw = scene.draw
-    columns = ("category", "sequence", "n_views", "draw", "seed")
     return {
         "key": job.folder.name,
         "method": job.method.name,
         "options": dict(job.method.options),
-        **{name: getattr(draw, name) for name in columns},
+        **{name: getattr(draw, name) for name in _DRAW},
         "scene": job.scene.name,
         "device": job.device,
         "hashes": dict(job.hashes),
@@ -125,11 +128,10 @@ def _made(job: CellJob, scene: Scene) -> tuple[dict[str, Any], dict[str, bytes],
     """
     if job.images_from is not None:
         before = read_json(job.images_from / "cell.json")
-        kept = ("seconds", "wall_seconds", "peak_memory_mib", "given", "counts")
         pictures, points = (
             read_cell_files(job.images_from, before, kind) for kind in ("images", "points")
         )
-        return {name: before[name] for name in kept}, pictures, points
+        return {name: before[name] for name in _MEASURED}, pictures, points
     inputs = scene.inputs()
     with PeakMemory() as memory, Stopwatch() as watch:
         synthesis = _synthesize(job, inputs)
@@ -146,8 +148,6 @@ def _made(job: CellJob, scene: Scene) -> tuple[dict[str, Any], dict[str, bytes],
 
 
 def _synthesize(job: CellJob, inputs: SceneInputs) -> Synthesis:
-    if job.device != "cuda":
-        os.environ["CUDA_VISIBLE_DEVICES"] = ""
     torch.manual_seed(inputs.seed)
     synthesis = build_method(job.method).synthesize(inputs)
     wanted = (len(inputs.targets.world_to_cam), 3, inputs.targets.height, inputs.targets.width)
@@ -195,13 +195,21 @@ def read_cell(folder: Path) -> dict[str, Any] | None:
     if not (folder / "cell.json").is_file():
         return None
     record = read_json(folder / "cell.json")
-    if not isinstance(record, dict) or record.get("key") != folder.name or "status" not in record:
+    if not isinstance(record, dict) or record.get("key") != folder.name or not _is_whole(record):
         raise InputError(f"{folder / 'cell.json'}: is no record of this cell")
     for name, stated in (record.get("images", {}) | record.get("points", {})).items():
         file = folder / name
         if not file.is_file() or hashlib.sha256(file.read_bytes()).hexdigest() != stated:
             raise InputError(f"{file}: is missing, or not what its cell's hash says")
     return record
+
+
+def _is_whole(record: Mapping[str, Any]) -> bool:
+    """Whether it has every entry that is read from a cell of its status."""
+    needed = {"method", "status", "reason", "scene", "device", "hashes", *_DRAW}
+    if record.get("status") == OK:
+        needed |= {"metrics", "images", "points", *_MEASURED}
+    return needed <= record.keys()
 
 
 def scores_of(record: Mapping[str, Any]) -> dict[str, Score]:

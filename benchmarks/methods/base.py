@@ -35,8 +35,8 @@ class SceneInputs:
 
     category: str
     views: tuple[View, ...]
-    """The input photographs with their cameras, in world units of the capture. They carry depth
-    only where the depth source is the data set's: ask `depth_source`, not the views.
+    """The input photographs with their cameras, in world units of the capture. They carry what
+    `depth_source` found: ask it, not the views, for it charges what finding depth took.
     """
     targets: Camera
     """Batched `n`: where views are to be made. Inputs and targets have one image size."""

@@ -1,6 +1,7 @@
 """A table ends with every cell that can be made, however its methods, files and options fail."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -8,7 +9,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from benchmarks import cells
 from benchmarks.__main__ import main
+from benchmarks.catalogue import Catalogue
 from benchmarks.compare import compare
 from benchmarks.results import TIDY, read_results
 from benchmarks.verify import verify
@@ -129,17 +132,40 @@ def test_a_failed_cell_is_tried_again_and_a_finished_one_not(
     assert "2 finished and used again, 2 open" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("damage", [b"", b"{", b"[]", b'{"key": "other"}'])
+@pytest.mark.parametrize("damage", [b"", b"{", b"[]", b'{"key": "other"}', b"bare"])
 def test_a_corrupt_cell_is_announced_and_made_anew(
     damage: bytes, own: Path, finished: Path, copy: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     victim = next(copy.glob("greys/cells/*/cell.json"))
-    victim.write_bytes(damage)
+    bare = json.dumps({"key": victim.parent.name, "status": "ok"}).encode()
+    victim.write_bytes(bare if damage == b"bare" else damage)
     assert run_greys(own, copy) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "made anew" in said
     assert "3 finished and used again, 1 open" in said
     pd.testing.assert_frame_equal(_table(copy), _table(finished))
+
+
+def test_a_cell_of_the_cpu_sees_no_gpu_from_its_start(
+    own: Path, copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Asking a GPU for its peak memory opens it, and hiding it afterwards changes nothing."""
+    seen = []
+
+    class Watched(cells.PeakMemory):
+        def __enter__(self) -> "Watched":
+            seen.append(os.environ.get("CUDA_VISIBLE_DEVICES"))
+            super().__enter__()
+            return self
+
+    monkeypatch.setattr(cells, "PeakMemory", Watched)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
+    table = Catalogue.with_own([str(own)]).table("greys", [f"output={copy}", "device=cpu"])
+    dark = Catalogue.with_own([str(own)]).method("dark")
+    scene = next(copy.glob("greys/scenes/*"))
+    job = cells.CellJob(copy / "greys/cells/new", scene, dark, table.scoring, "cpu", {})
+    assert cells.run_cell(job)["status"] == "ok"
+    assert seen == [""]
 
 
 def test_a_changed_picture_is_noticed(own: Path, copy: Path) -> None:
