@@ -35,7 +35,7 @@ def _over_angle(part: pd.DataFrame, metric: str, results: Results) -> str:
     figure, row = plt.subplots(
         1,
         len(draws),
-        figsize=(5 * len(draws), 3.6),
+        figsize=(5 * len(draws) + 1.2, 3.6),
         squeeze=False,
         sharey=True,
         layout="constrained",
@@ -49,7 +49,7 @@ def _over_angle(part: pd.DataFrame, metric: str, results: Results) -> str:
         axes.set_title(f"{draw} inputs")
         axes.set_xlabel("angle to the nearest input, degrees")
     row[0][0].set_ylabel(name_of(metric))
-    row[0][-1].legend(fontsize="small")
+    _legend(figure, row[0][-1])
     return _svg(figure)
 
 
@@ -64,7 +64,7 @@ def _binned(axes: Axes, own: pd.DataFrame, label: str) -> None:
 def _over_time(means: pd.DataFrame, metric: str, results: Results) -> str:
     """A point a method and number of views."""
     wide = means.pivot_table(index=["method", "draw", "n_views"], columns="metric", values="mean")
-    figure, axes = plt.subplots(figsize=(5, 3.6), layout="constrained")
+    figure, axes = plt.subplots(figsize=(6.2, 3.6), layout="constrained")
     for method, entry in results.methods.items():
         own = wide[wide.index.get_level_values("method") == method]
         if len(own):
@@ -72,8 +72,14 @@ def _over_time(means: pd.DataFrame, metric: str, results: Results) -> str:
     axes.set_xscale("log")
     axes.set_xlabel("perform time, seconds (in all, or per image: see the notes)")
     axes.set_ylabel(name_of(metric))
-    axes.legend(fontsize="small")
+    _legend(figure, axes)
     return _svg(figure)
+
+
+def _legend(figure: Figure, axes: Axes) -> None:
+    """Beside the panels, where it hides no point."""
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right upper", fontsize="small")
 
 
 def _svg(figure: Figure) -> str:
