@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,32 +9,12 @@ import pandas as pd
 import pytest
 
 from benchmarks import cells
-from benchmarks.__main__ import main
 from benchmarks.catalogue import Catalogue
 from benchmarks.compare import compare
 from benchmarks.results import TIDY, read_results
-from benchmarks.verify import verify
 from extrap_train.errors import InputError
 from extrap_train.jobs.slurm import SubmittedLauncher
-from tests.benchmarks.tables import greys_folder, run_greys, write_own
-
-
-@pytest.fixture(scope="module")
-def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_own(tmp_path_factory.mktemp("own"))
-
-
-@pytest.fixture(scope="module")
-def finished(own: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    output = tmp_path_factory.mktemp("results")
-    assert run_greys(own, output) == 0
-    return output
-
-
-@pytest.fixture
-def copy(finished: Path, tmp_path: Path) -> Path:
-    shutil.copytree(finished, tmp_path / "results")
-    return tmp_path / "results"
+from tests.benchmarks.tables import greys_folder, run_greys
 
 
 def _table(output: Path) -> pd.DataFrame:
@@ -168,49 +147,6 @@ def test_a_cell_of_the_cpu_sees_no_gpu_from_its_start(
     assert seen == [""]
 
 
-def test_a_changed_picture_is_noticed(own: Path, copy: Path) -> None:
-    folder = greys_folder(copy)
-    assert verify(folder) == (4, [])
-    picture = next(copy.glob("greys/cells/*/0.png"))
-    picture.write_bytes(picture.read_bytes()[:-1] + b"!")
-    with pytest.raises(InputError, match="not what its cell's hash says"):
-        verify(folder)
-    assert main(["verify", str(folder.path)]) == 1
-
-
-def test_verify_finds_a_forged_number_truth_and_protocol(copy: Path) -> None:
-    folder = greys_folder(copy)
-    file = next(copy.glob("greys/cells/*/cell.json"))
-    record = json.loads(file.read_text())
-    record["metrics"]["psnr"]["value"] += 0.5
-    file.write_text(json.dumps(record))
-    assert any("psnr is stated as" in problem for problem in verify(folder)[1])
-    mask = next(copy.glob("greys/scenes/*/masks/0.png"))
-    mask.write_bytes(next(copy.glob("greys/scenes/*/truth/0.png")).read_bytes())
-    assert any("masks/0.png is not what its hash says" in p for p in verify(folder)[1])
-    protocol = folder.protocol.read_text()
-    folder.protocol.write_text(protocol.replace('"pool": 9', '"pool": 8'))
-    assert any("not what its hash" in problem for problem in verify(folder)[1])
-
-
-def test_verify_finds_what_is_left_out_and_what_only_pictures_show(copy: Path) -> None:
-    folder = greys_folder(copy)
-    files = sorted(copy.glob("greys/cells/*/cell.json"))
-    records = [json.loads(file.read_text()) for file in files]
-    del records[0]["metrics"]["masked_psnr"]
-    records[1]["metrics"]["psnr"]["per_image"][0] += 1
-    records[2]["hashes"]["weights"] = "0" * 64
-    for file, record in zip(files, records, strict=True):
-        file.write_text(json.dumps(record))
-    table = folder.path / "greys_mean.csv"
-    table.write_text(table.read_text().replace("dark", "best"))
-    said = "\n".join(verify(folder)[1])
-    assert "masked_psnr is not stated, computed as" in said
-    assert "psnr by image is stated as" in said
-    assert "its name does not follow from the hashes" in said
-    assert "greys_mean.csv: is not what the cells say" in said
-
-
 def test_a_protocol_without_results_gives_way(own: Path, tmp_path: Path) -> None:
     """A first command that was wrong does not spoil the folder for the right one."""
     assert run_greys(own, tmp_path, "rules.image_size=16", dry_run=True) == 0
@@ -328,21 +264,6 @@ def test_a_cluster_makes_the_same_table(own: Path, finished: Path, tmp_path: Pat
     assert run_greys(own, tmp_path, launcher=launcher) == 0
     pd.testing.assert_frame_equal(_table(tmp_path), _table(finished))
     assert _pictures(tmp_path) == _pictures(finished)
-
-
-def test_geometry_is_scored_kept_and_verified(own: Path, copy: Path) -> None:
-    """Five points where the apples stand, under them: they show nothing of their surface."""
-    assert run_greys(own, copy, "methods=[solid,dark]") == 0
-    table = pd.read_csv(copy / "greys" / "greys.csv").set_index(["method", "metric"])["value"]
-    assert (table["solid", "f_score"] == 0).all()
-    assert (table["solid", "accuracy_distance"] > 0.01).all()
-    assert table["dark", "f_score"].isna().all()
-    folder = greys_folder(copy)
-    assert verify(folder) == (4, [])
-    cloud = next(copy.glob("greys/cells/*/points.npy"))
-    cloud.write_bytes(cloud.read_bytes()[:-1] + b"!")
-    with pytest.raises(InputError, match="not what its cell's hash says"):
-        verify(folder)
 
 
 def test_a_quick_table_says_that_it_is_one(own: Path, finished: Path, tmp_path: Path) -> None:
