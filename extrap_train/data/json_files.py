@@ -3,6 +3,7 @@
 import codecs
 import gzip
 import json
+import re
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +17,7 @@ GZIP_RATIO = 100
 """Annotations shrink to between a third and a tenth; a decompression bomb, to a thousandth."""
 _PIECE_BYTES = 2**20
 _SPACE = " \t\r\n"
+_CUT_NUMBER = re.compile(r"[-+.eE0-9]*\Z")
 
 
 def read_json(path: Path) -> Any:
@@ -87,8 +89,8 @@ class _Text:
                 if isinstance(error, RecursionError) or not self._read_on(len(self._text)):
                     _refuse(self.path, error)
                 continue
-            # A number may go on in the next piece.
-            if end == len(self._text) and self._read_on(1):
+            # A number may go on in the next piece, and of `1.` or `1e-` only the 1 is a value.
+            if _CUT_NUMBER.match(self._text, end) and self._read_on(1):
                 continue
             self._at = end
             return value

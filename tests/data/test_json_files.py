@@ -47,6 +47,17 @@ def test_entries_are_those_of_the_whole_list(
             assert list(read_json_list(file, "things")) == expected == read_json(file)
 
 
+@pytest.mark.parametrize("piece", range(1, 8))
+@pytest.mark.parametrize("number", ["0.0", "-1.5", "1e-05", "2E+3", "-0", "17"])
+def test_a_number_is_whole_wherever_a_piece_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: str, piece: int
+) -> None:
+    monkeypatch.setattr(json_files, "_PIECE_BYTES", piece)
+    file = tmp_path / "list.json"
+    file.write_text(f"[{number},{number}]")
+    assert list(read_json_list(file, "things")) == [float(number)] * 2
+
+
 @pytest.mark.parametrize("piece", [1, 3, 1000])
 @pytest.mark.parametrize(
     "text", ["[1, 2", "[1 2]", "[1,]", "[1, 2] 3", "[1, 2]]", '["a', "[1, nul]", "[{1: 2}]", ""]
