@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis, Unavailable
-from benchmarks.methods.gaussians.checks import check_range
+from benchmarks.methods.checks import check_range
 from benchmarks.methods.references import views_with_depth
 from extrap_train.config import SamplerConfig
 from extrap_train.diffusion.checkpoint import load_model

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from benchmarks.methods.gaussians.checks import check_range, check_word
+from benchmarks.methods.checks import check_range, check_word
 from benchmarks.methods.gaussians.density import remove
 from benchmarks.methods.gaussians.depth_losses import (
     edge_aware_smoothness,

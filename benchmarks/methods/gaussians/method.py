@@ -11,9 +11,6 @@ from benchmarks.methods.gaussians.recipe import Recipe
 from benchmarks.methods.gaussians.scene import TrainingScene, training_scene
 from benchmarks.methods.gaussians.trainer import Fit, fit
 
-SURFACE_OPACITY = 0.5
-"""More transparent Gaussians are no points of the surface."""
-
 
 @dataclass(frozen=True)
 class GaussianMethod(GaussianOptions, ABC):
@@ -35,11 +32,10 @@ class GaussianMethod(GaussianOptions, ABC):
         """Fit, and draw every target; the time is that of preprocessing and optimisation."""
         with Stopwatch() as watch:
             trained = self.fitted(inputs)
-        gaussians = trained.gaussians()
         return Synthesis(
             images=trained.render(inputs.targets),
             seconds=watch.seconds,
             given=trained.record,
-            points=gaussians.means[gaussians.opacities > SURFACE_OPACITY],
-            counts={"gaussians": float(len(gaussians))},
+            points=trained.seen_surface(),
+            counts={"gaussians": float(len(trained.parameters.means))},
         )

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from benchmarks.methods.gaussians.checks import check_range, check_word
+from benchmarks.methods.checks import check_range, check_word
 from extrap_train.errors import InputError
 
 INITS = ("triangulated", "dense", "random")

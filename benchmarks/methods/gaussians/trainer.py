@@ -22,6 +22,7 @@ from benchmarks.methods.gaussians.points import Points
 from benchmarks.methods.gaussians.recipe import Recipe, Training
 from benchmarks.methods.gaussians.schedule import Schedule, exponential
 from extrap_train.errors import InputError
+from extrap_train.geometry.cameras import unproject_to_world
 from extrap_train.views import Camera
 
 WIDEST_START = 0.05
@@ -30,6 +31,8 @@ so far that each Gaussian would cover a whole image, which is slow and shows not
 """
 FARTHEST = 1e5
 """Distance from the scene's centre, in extents, that no Gaussian reaches on purpose."""
+LEAST_ALPHA = 0.5
+"""Of a pixel that shows a surface; with less, most of what it shows is behind the Gaussians."""
 
 
 class Diverged(InputError):
@@ -56,6 +59,22 @@ class Fit:
     def record(self) -> dict[str, str]:
         """What was used and what happened, in words."""
         return self.recipe.scene.record
+
+    @torch.no_grad()
+    def seen_surface(self) -> Float[Tensor, "m 3"]:
+        """The surface that the inputs see, in the world: a point for every pixel of theirs with an
+        alpha above `LEAST_ALPHA`, on its ray at the expected depth.
+
+        The Gaussians' own centres would not do: after a short optimisation nearly all are faint,
+        and only together they hide what is behind.
+        """
+        points = []
+        for index in range(len(self.recipe.cameras)):
+            camera = self.recipe.camera(index)
+            drawing = self.recipe.draw(self.parameters, camera)
+            on_rays = unproject_to_world(drawing.depth, camera)
+            points.append(on_rays[drawing.alpha > LEAST_ALPHA])
+        return self.recipe.scene.frame.to_world(torch.cat(points)).cpu()
 
     @torch.no_grad()
     def gaussians(self) -> Gaussians:
