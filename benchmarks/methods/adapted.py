@@ -6,8 +6,8 @@ from lightning.fabric import Fabric
 from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 
 from benchmarks.methods.base import SceneInputs
-from benchmarks.methods.diffusion import Diffusion, Painted
 from benchmarks.methods.checks import check_range
+from benchmarks.methods.diffusion import Diffusion, Painted
 from benchmarks.methods.references import views_with_depth
 from extrap_train.config import LoraConfig
 from extrap_train.data.scene_pairs import ScenePairs

@@ -32,9 +32,9 @@ def test_faint_gaussians_are_a_surface_where_they_hide_together() -> None:
     points = fit.seen_surface()
     assert len(points) > 100
     off = (points - center) @ normal / fit.recipe.scene.frame.unit
-    straight_ahead = off[:100]
+    straight_ahead = off[:100]  # Aside, a pixel shares Gaussians whose depths differ.
     assert straight_ahead.abs().max() < 1e-5
-    assert off.abs().max() < 0.05
+    assert off.abs().max() < 0.1
     aside = (points - center).norm(dim=-1) / fit.recipe.scene.frame.unit
     assert aside.max() < 0.4 * 2**0.5 + 0.05
 
