@@ -1,7 +1,7 @@
 """Diffusion methods as rows of a table: a model of one family samples every target view."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -67,7 +67,7 @@ class Diffusion:
 
     def synthesize(self, inputs: SceneInputs) -> Synthesis:
         """Paint every target; the time is that of a single image, its share of all that the scene
-        takes.
+        takes once everything is compiled and loaded.
         """
         folder = self._folder(inputs.category)
         model = _loaded(folder)
@@ -76,6 +76,7 @@ class Diffusion:
                 f"{folder}: is a model of the family {model.config.family}, not {self.family}; "
                 "give weights= of the right one"
             )
+        self._warm_up(model, inputs)
         with Stopwatch() as watch:
             made = self.painted(model, inputs)
         size = (inputs.targets.height, inputs.targets.width)
@@ -101,6 +102,13 @@ class Diffusion:
     def generator(self, model: ExtrapolationModel) -> DiffusionGenerator:
         """What paints views with this method's options."""
         return DiffusionGenerator(model, self.sampler, references=self.references)
+
+    def _warm_up(self, model: ExtrapolationModel, inputs: SceneInputs) -> None:
+        """Paint in one step: the first pictures of a process, and of each shape, wait for kernels
+        to be compiled and chosen, which would fall to whichever cell comes first.
+        """
+        quick = replace(self.generator(model), sampler=replace(self.sampler, steps=1))
+        quick.generate(views_with_depth(inputs), inputs.targets, target_names(inputs), inputs.seed)
 
     def _folder(self, category: str) -> Path:
         name = (self.weights or packaged_name(self.family, category)).replace(

@@ -1,6 +1,7 @@
 """Rows of a diffusion model: what each variant is told, that it repeats, and what it leaves."""
 
 import shutil
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -61,7 +62,10 @@ def _own_models() -> Iterator[None]:
 
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, list[View], Tensor]]:
-    """Every target in the order in which it is painted, the views it is given, and its picture."""
+    """Every target in the order in which it is painted, the views it is given, and its picture;
+    not what only warms the machine up.
+    """
+    monkeypatch.setattr(Diffusion, "_warm_up", lambda *_: None)
     calls: list[tuple[str, list[View], Tensor]] = []
     generate = DiffusionGenerator.generate
 
@@ -160,6 +164,24 @@ def test_time_is_a_limit_that_the_row_tells_of(weights: str) -> None:
     made = method.synthesize(scene_inputs()[0])
     assert made.given["adaptation ended by"] == "time"
     assert made.counts["adaptation_steps"] < 100_000
+
+
+def test_what_a_process_does_once_is_not_a_cells_time(
+    weights: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first picture compiles; a later one could not be told from it by its time."""
+    inputs, _ = scene_inputs(size=32)
+    generate, calls = DiffusionGenerator.generate, []
+
+    def slow_at_first(self, references, queries, names, seed=0):
+        calls.append(names)
+        if len(calls) == 1:
+            time.sleep(2)
+        return generate(self, references, queries, names, seed)
+
+    monkeypatch.setattr(DiffusionGenerator, "generate", slow_at_first)
+    assert Diffusion(weights=weights).synthesize(inputs).seconds * len(calls[0]) < 2
+    assert len(calls) == 2
 
 
 def test_what_is_painted_is_a_reference_for_the_next(
