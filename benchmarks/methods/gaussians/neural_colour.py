@@ -1,7 +1,9 @@
 """DNGaussian's colour: a hash grid over space and two small networks (section 3.4)."""
 
+from collections.abc import Callable
+
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor, nn
 
 from benchmarks.methods.gaussians.spherical_harmonics import sh_basis
@@ -25,8 +27,7 @@ class HashGrid(nn.Module):
         self.cells = nn.Buffer(torch.tensor(cells, dtype=torch.float32))
         self.size, self.bound = 2**log2_size, bound
         self.table = nn.Parameter(torch.empty(levels * self.size, 2).uniform_(-1e-4, 1e-4))
-        corners = [[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)]
-        self.corners = nn.Buffer(torch.tensor(corners))
+        self.near_far = nn.Buffer(torch.tensor([0, 1]))
 
     @property
     def width(self) -> int:
@@ -38,18 +39,28 @@ class HashGrid(nn.Module):
         unit = ((positions / self.bound + 1) / 2).clamp(0, 1)
         place = unit[:, None] * self.cells[:, None]
         low = place.floor()
-        part = (place - low)[:, :, None]
-        corner = low.long()[:, :, None] + self.corners
-        weight = torch.where(self.corners == 1, part, 1 - part).prod(-1)
+        far = (place - low)[..., None]
+        weight = _per_corner(torch.cat([1 - far, far], -1), torch.mul)
+        index = hashed(low.long()[..., None] + self.near_far) & (self.size - 1)
         level = torch.arange(len(self.cells), device=positions.device)[:, None] * self.size
-        values = self.table[hashed(corner) % self.size + level]
+        values = self.table[index + level]
         return (values * weight[..., None]).sum(2).flatten(1)
 
 
-def hashed(corner: Int[Tensor, "*b 3"]) -> Int[Tensor, "*b"]:
-    """The spatial hash of Teschner et al. (2003)."""
-    x, y, z = (corner[..., i] * _PRIMES[i] for i in range(3))
-    return x ^ y ^ z
+def hashed(sides: Int[Tensor, "*b 3 2"]) -> Int[Tensor, "*b 8"]:
+    """The spatial hash of Teschner et al. (2003) at the eight corners of a cell, from the cell's
+    two sides along x, y and z; the last axis is the fastest.
+    """
+    spread = [side * prime for side, prime in zip(sides.unbind(-2), _PRIMES, strict=True)]
+    return _per_corner(torch.stack(spread, -2), torch.bitwise_xor)
+
+
+def _per_corner(
+    sides: Shaped[Tensor, "*b 3 2"], combine: Callable[[Tensor, Tensor], Tensor]
+) -> Shaped[Tensor, "*b 8"]:
+    x, y, z = sides.unbind(-2)
+    xy = combine(x[..., :, None], y[..., None, :])
+    return combine(xy[..., None], z[..., None, None, :]).flatten(-3)
 
 
 class NeuralColor(nn.Module):

@@ -166,10 +166,17 @@ def _iterate(recipe: Recipe, training: Training, modules: "_ModuleOptimiser", in
 def _check(training: Training, modules: "_ModuleOptimiser") -> None:
     """What a loss of finite numbers can hide: a Gaussian that is NaN is not drawn."""
     for name, values in _tensors(training).items():
-        if not values.isfinite().all():
+        if not is_finite(values):
             raise _diverged(f"{name} stopped being finite", training)
     if not modules.is_finite():
         raise _diverged("what is learnt beside the Gaussians stopped being finite", training)
+
+
+def is_finite(values: Float[Tensor, "..."]) -> bool:
+    """Whether no number is NaN or infinite, or so large that their sum is: one pass, where asking
+    every number took half the time of an iteration with a hash grid.
+    """
+    return bool(values.sum().isfinite())
 
 
 def _diverged(what: str, training: Training) -> Diverged:
@@ -206,7 +213,7 @@ class _ModuleOptimiser:
 
     def is_finite(self) -> bool:
         """Whether no number that is learnt is NaN or infinite."""
-        return all(bool(value.isfinite().all()) for value in self._learnt)
+        return all(is_finite(value.detach()) for value in self._learnt)
 
     def step(self, progress: float) -> None:
         """One step along the gradients, which are then forgotten."""

@@ -2,7 +2,7 @@
 
 import torch
 
-from benchmarks.methods.gaussians.neural_colour import HashGrid, NeuralColor
+from benchmarks.methods.gaussians.neural_colour import HashGrid, NeuralColor, hashed
 
 
 def test_the_grid_is_its_table_at_corners_and_linear_between():
@@ -38,3 +38,10 @@ def test_a_colour_pattern_is_learnt():
         loss.backward()
         adam.step()
     assert float(loss) < 0.01
+
+
+def test_the_hash_is_that_of_each_corners_three_coordinates() -> None:
+    sides = torch.tensor([[[3, 4], [-2, -1], [70, 71]]])
+    corners = [(x, y, z) for x in (3, 4) for y in (-2, -1) for z in (70, 71)]
+    expected = [x ^ (y * 2_654_435_761) ^ (z * 805_459_861) for x, y, z in corners]
+    assert hashed(sides).tolist() == [expected]
