@@ -1,14 +1,14 @@
 """From a table to its cells: protocol, prepared draws, and what each cell is named by."""
 
 import inspect
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
 
 from benchmarks.captures import Capture, freeze, open_captures
-from benchmarks.cells import OK, CellJob, read_cell
+from benchmarks.cells import CellJob
 from benchmarks.fingerprint import code_hash, weights_hash
 from benchmarks.methods.base import Unavailable
 from benchmarks.methods.build import build_method
@@ -16,6 +16,7 @@ from benchmarks.protocol import Draw, Protocol, digest
 from benchmarks.scenes import Scene, prepare_scene
 from benchmarks.scoring import scoring_files
 from extrap_train.config import MethodConfig, TableConfig
+from extrap_train.data.frame_files import sequence_folder
 from extrap_train.errors import InputError
 
 KEY_LENGTH = 20
@@ -43,6 +44,11 @@ class TableFolder:
     def scenes(self) -> Path:
         """A folder a prepared draw."""
         return self.path / "scenes"
+
+    def scene(self, draw: Draw) -> Path:
+        """Where a draw is prepared; its capture's name is untrusted and leads nowhere else."""
+        flat = draw.label.replace("/", "\0")  # in no name, so that two names stay two folders
+        return sequence_folder(self.path, self.scenes.name, flat)
 
     @property
     def plan(self) -> Path:
@@ -111,7 +117,7 @@ def prepare_draws(
     for draw in draws:
         origin = digest([code, asdict(table.captures), asdict(table.rules), asdict(draw)])
         capture = by_name[draw.category, draw.sequence]
-        yield prepare_scene(folder.scenes / draw.label, capture, draw, table.rules, origin)
+        yield prepare_scene(folder.scene(draw), capture, draw, table.rules, origin)
 
 
 def cell_jobs(
@@ -199,49 +205,3 @@ def _device(wanted: str) -> str:
     if wanted == "cuda" and not torch.cuda.is_available():
         raise InputError("device=cuda: there is no CUDA device here; give device=cpu")
     return "cuda" if wanted != "cpu" and torch.cuda.is_available() else "cpu"
-
-
-def finished(
-    jobs: list[CellJob], folder: TableFolder, say: Callable[[str], None]
-) -> tuple[list[CellJob], list[CellJob]]:
-    """The jobs that are done and those that are to be run, the latter with images to score again
-    where only the scoring has changed. Damaged cells are announced and made anew.
-    """
-    done, open_jobs = [], []
-    for job in jobs:
-        record = _record(job.folder, say)
-        if record is not None and record["status"] == OK:
-            done.append(job)
-        else:
-            open_jobs.append(job)
-    if open_jobs:
-        images = _finished_images(folder, {job.folder for job in jobs})
-        open_jobs = [_with_images(job, images.get(job.hashes["images"])) for job in open_jobs]
-    return done, open_jobs
-
-
-def _record(folder: Path, say: Callable[[str], None]) -> dict[str, object] | None:
-    try:
-        return read_cell(folder)
-    except InputError as error:
-        say(f"{error}: made anew")
-        return None
-
-
-def _finished_images(folder: TableFolder, current: set[Path]) -> dict[str, Path]:
-    """Cells of other scorings by what decides their images."""
-    found: dict[str, Path] = {}
-    for cell in folder.cells.glob("*/cell.json"):
-        if cell.parent in current:
-            continue
-        try:
-            record = read_cell(cell.parent)
-        except InputError:
-            continue
-        if record is not None and record["status"] == OK:
-            found[record["hashes"]["images"]] = cell.parent
-    return found
-
-
-def _with_images(job: CellJob, images_from: Path | None) -> CellJob:
-    return CellJob(**{**vars(job), "images_from": images_from})

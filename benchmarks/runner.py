@@ -23,11 +23,11 @@ from benchmarks.plan import (
     Selection,
     TableFolder,
     cell_jobs,
-    finished,
     open_protocol,
     prepare_draws,
 )
 from benchmarks.results import read_results
+from benchmarks.reuse import finished
 from extrap_train.config import SlurmConfig, TableConfig
 from extrap_train.data.files import write_whole
 from extrap_train.errors import InputError
