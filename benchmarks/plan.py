@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.backbones import judging_files
 from benchmarks.captures import Capture, freeze, open_captures
 from benchmarks.cells import CellJob
 from benchmarks.fingerprint import code_hash, weights_hash
@@ -14,7 +15,6 @@ from benchmarks.methods.base import Unavailable
 from benchmarks.methods.build import build_method
 from benchmarks.protocol import Draw, Protocol, digest
 from benchmarks.scenes import Scene, prepare_scene
-from benchmarks.scoring import scoring_files
 from extrap_train.config import MethodConfig, TableConfig
 from extrap_train.data.frame_files import sequence_folder
 from extrap_train.errors import InputError
@@ -136,7 +136,7 @@ def cell_jobs(
     scoring = digest(
         [
             asdict(table.scoring) | {"lpips_weights": sorted(table.scoring.lpips_weights)},
-            weights_hash(scoring_files(table.scoring)),
+            weights_hash([*judging_files(table.scoring).values()]),
             code_hash(["benchmarks.scoring"]),
         ]
     )

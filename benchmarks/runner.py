@@ -1,21 +1,19 @@
 """Run a table: what is missing is made, what is there is used, and the reports are written."""
 
-import json
 import os
-import statistics
 import time
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
 from rich.console import Console
 from rich.live import Live
-from rich.table import Table
 
+from benchmarks.backbones import judging_hashes
 from benchmarks.catalogue import Catalogue
 from benchmarks.cells import FAILED, OK, CellJob, died_record, run_cell
 from benchmarks.files import json_bytes
@@ -26,9 +24,11 @@ from benchmarks.plan import (
     open_protocol,
     prepare_draws,
 )
+from benchmarks.progress import Progress, print_plan
+from benchmarks.protocol import Protocol
 from benchmarks.results import read_results
 from benchmarks.reuse import finished
-from extrap_train.config import SlurmConfig, TableConfig
+from extrap_train.config import MethodConfig, SlurmConfig, TableConfig
 from extrap_train.data.files import write_whole
 from extrap_train.errors import InputError
 from extrap_train.jobs import Died, Launcher
@@ -47,29 +47,6 @@ class RunOptions:
     slurm: bool = False
     launcher: Launcher | None = None
     """In place of the above."""
-
-
-@dataclass
-class Progress:
-    """How a table stands, for the live view."""
-
-    total: int
-    counts: dict[str, dict[str, int]] = field(default_factory=lambda: defaultdict(dict))
-    seconds: list[float] = field(default_factory=list)
-
-    def note(self, method: str, status: str) -> None:
-        """One more cell of a method has this status."""
-        row = self.counts[method]
-        row[status] = row.get(status, 0) + 1
-
-    def view(self, left: int, elapsed: float, done_now: int) -> Table:
-        """The table as it stands, with the expected rest."""
-        rest = elapsed / done_now * left if done_now else 0.0
-        eta = f", about {_duration(rest)} left" if done_now and left else ""
-        shown = Table("method", "ok", "failed", "unavailable", title=f"{left} cells open{eta}")
-        for method, row in self.counts.items():
-            shown.add_row(method, *(str(row.get(s, 0)) for s in ("ok", "failed", "unavailable")))
-        return shown
 
 
 def run_table(table: TableConfig, catalogue: Catalogue, options: RunOptions) -> int:
@@ -128,15 +105,9 @@ def _run(
     done, waiting = finished(jobs, folder, console.print)
     console.print(f"{len(jobs)} cells: {len(done)} finished and used again, {len(waiting)} open")
     if options.dry_run:
-        _print_plan(jobs, waiting, folder, console)
+        print_plan(jobs, waiting, folder, console)
         return 0
-    plan = {
-        "table": asdict(table),
-        "quick": options.quick,
-        "protocol": protocol.sha256,
-        "methods": {m.name: {"title": m.title, "group": m.group, "time": m.time} for m in methods},
-        "cells": [job.folder.name for job in jobs],
-    }
+    plan = _plan(table, options, protocol, methods, jobs)
     progress = Progress(len(jobs))
     for job in done:
         progress.note(job.method.name, OK)
@@ -155,7 +126,25 @@ def _run(
     return sum(1 for cell in results.cells if cell["status"] == FAILED)
 
 
-def _with_options(catalogue: Catalogue, name: str, table: TableConfig) -> Any:
+def _plan(
+    table: TableConfig,
+    options: RunOptions,
+    protocol: Protocol,
+    methods: list[MethodConfig],
+    jobs: list[CellJob],
+) -> dict[str, Any]:
+    """What the results are of: all that reports and verification ask beside the cells."""
+    return {
+        "table": asdict(table),
+        "quick": options.quick,
+        "protocol": protocol.sha256,
+        "networks": judging_hashes(table.scoring),
+        "methods": {method.name: asdict(method) for method in methods},
+        "cells": [job.folder.name for job in jobs],
+    }
+
+
+def _with_options(catalogue: Catalogue, name: str, table: TableConfig) -> MethodConfig:
     method = catalogue.method(name)
     return replace(method, options={**method.options, **table.options.get(name, {})})
 
@@ -200,44 +189,3 @@ def _launcher(
         cores = 1 if device == "cuda" else len(os.sched_getaffinity(0))
         with LocalLauncher(options.workers or cores, apart=True) as local:
             yield local
-
-
-def _print_plan(
-    jobs: list[CellJob], waiting: list[CellJob], folder: TableFolder, console: Console
-) -> None:
-    """What would run, how long by what finished cells took, and what is missing."""
-    took = _seconds_by_method(folder)
-    shown = Table("method", "cells", "open", "seconds a cell", "missing")
-    total, unknown = 0.0, []
-    for name in dict.fromkeys(job.method.name for job in jobs):
-        mine = [job for job in jobs if job.method.name == name]
-        still = [job for job in waiting if job.method.name == name]
-        seconds = statistics.median(took[name]) if took.get(name) else None
-        total += (seconds or 0) * len(still)
-        unknown += [name] if seconds is None and still else []
-        weights = mine[0].hashes["weights"]
-        missing = weights.removeprefix("missing: ") if weights.startswith("missing") else ""
-        rate = f"{seconds:.1f}" if seconds is not None else "not yet known"
-        shown.add_row(name, str(len(mine)), str(len(still)), rate, missing)
-    console.print(shown)
-    known = [f"about {_duration(total)} of one core"] if total or not unknown else []
-    more = [f"no finished cell tells how long {', '.join(unknown)} will take"] if unknown else []
-    console.print("; ".join([*known, *more]))
-
-
-def _seconds_by_method(folder: TableFolder) -> dict[str, list[float]]:
-    """Wall time of finished cells of any options, from their records."""
-    took: dict[str, list[float]] = defaultdict(list)
-    for file in folder.cells.glob("*/cell.json"):
-        try:
-            record = json.loads(file.read_text())
-            took[record["method"]].append(float(record["wall_seconds"]))
-        except (OSError, ValueError, KeyError):
-            continue
-    return took
-
-
-def _duration(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s"
