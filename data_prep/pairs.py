@@ -74,9 +74,8 @@ class PairFiles:
     def write(self, pairs: pd.DataFrame, flows: Float[np.ndarray, "m 2 g g"]) -> None:
         """Both files, whole or not at all."""
         with whole_folder(self.folder, lambda _: self.are_there()) as made:
-            np.save(made / FLOWS, flows.astype(np.float16))
             table = pa.Table.from_pandas(pairs, preserve_index=False)
-            write_sealed(table, made / TABLE, self.key)
+            write_sealed(table, made / TABLE, self.key, {FLOWS: flows.astype(np.float16)})
 
 
 def reference_frames(depth_share: Float[np.ndarray, "n"], lone: bool) -> Bool[np.ndarray, "n"]:

@@ -125,7 +125,8 @@ def _prepare(unit: Unit) -> None:
         frames = make_frames(unit.sequence, source, shop.options.image_size, unit.is_lone)
         write_frames(unit.frames_folder, frames, key)
         table = read_camera_table(unit.frames_folder, key)
-        assert table is not None
+        if table is None:
+            raise OSError(f"{unit.frames_folder}: the disk has not kept what was written")
     stored = StoredFrames.open(unit.frames_folder, table)
     make_pairs(
         unit.pair_files, stored, unit.name, unit.role, shop.options, shop.tools, unit.progress

@@ -10,7 +10,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 from filelock import FileLock
+from jaxtyping import Shaped
 
 from extrap_train.errors import InputError
 
@@ -96,6 +98,19 @@ def write_whole(path: Path, content: bytes) -> None:
         raise InputError(
             f"{path}: cannot be written ({error.strerror}); free space or choose another folder"
         ) from None
+
+
+def save_array(path: Path, array: Shaped[np.ndarray, "..."]) -> int:
+    """Write an array as NPY in C order; returns of how many bytes the file must be.
+
+    Raises OSError with the number of the system's error. `numpy.save` writes through C's buffers:
+    on a full disk its error has no number, or, where the last buffer is lost, there is none at all.
+    """
+    array = np.ascontiguousarray(array)
+    with path.open("wb") as file:
+        header = np.lib.format.header_data_from_array_1_0(array)
+        np.lib.format.write_array_header_1_0(file, header)
+        return file.tell() + file.write(array.data)
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -11,10 +12,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
-from extrap_train.data.files import file_stamp, whole_folder
+from extrap_train.data.files import file_stamp, save_array, whole_folder
 from extrap_train.views import Camera
 
 FLOWS = "flows.npy"
@@ -105,10 +106,8 @@ def write_frames(folder: Path, frames: SequenceFrames, key: str) -> None:
     scaled = frames.depths / scale
     scaled[scaled > np.finfo(np.float16).max] = 0
     with whole_folder(folder, lambda there: is_sealed(there / CAMERAS, key)) as made:
-        np.save(made / IMAGES, frames.images)
-        np.save(made / DEPTHS, scaled.astype(np.float16))
-        np.save(made / MASKS, frames.masks)
-        write_sealed(_camera_table(frames, scale), made / CAMERAS, key)
+        arrays = {IMAGES: frames.images, DEPTHS: scaled.astype(np.float16), MASKS: frames.masks}
+        write_sealed(_camera_table(frames, scale), made / CAMERAS, key, arrays)
 
 
 def read_camera_table(folder: Path, key: str) -> pa.Table | None:
@@ -116,9 +115,15 @@ def read_camera_table(folder: Path, key: str) -> pa.Table | None:
     return read_sealed(folder / CAMERAS, key)
 
 
-def write_sealed(table: pa.Table, file: Path, key: str) -> None:
-    """Write a table with `key`, what it was made from, and the sizes of the files beside it."""
-    sizes = {path.name: path.stat().st_size for path in sorted(file.parent.iterdir())}
+def write_sealed(
+    table: pa.Table, file: Path, key: str, arrays: Mapping[str, Shaped[np.ndarray, "..."]]
+) -> None:
+    """Write arrays by their files' names, and a table beside them that seals them.
+
+    It says by `key` what they were made from, and how long each file must be: what the disk has
+    made of them is compared with that, not with itself.
+    """
+    sizes = {name: save_array(file.parent / name, arrays[name]) for name in sorted(arrays)}
     seal = {_KEY: key.encode(), _SIZES: json.dumps(sizes).encode()}
     pq.write_table(table.replace_schema_metadata(seal), file)
 

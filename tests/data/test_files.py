@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from extrap_train.data.files import (
@@ -12,6 +13,7 @@ from extrap_train.data.files import (
     partial_beside,
     remove_partial,
     resolve_inside,
+    save_array,
     whole_folder,
     write_whole,
 )
@@ -150,3 +152,22 @@ def test_only_what_nobody_writes_any_more_is_removed(tmp_path):
     living.communicate()
     remove_partial(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {elsewhere}
+
+
+@pytest.mark.parametrize("shape", [(0, 2, 3), (5,), (3, 700, 4)])
+@pytest.mark.parametrize("kind", [np.uint8, np.float16, np.float32])
+def test_saved_arrays_are_numpys_files_of_the_stated_size(tmp_path, shape, kind):
+    array = (np.arange(np.prod(shape)) % 251).astype(kind).reshape(shape)
+    size = save_array(tmp_path / "ours.npy", array)
+    np.save(tmp_path / "numpys.npy", array)
+    assert (tmp_path / "ours.npy").read_bytes() == (tmp_path / "numpys.npy").read_bytes()
+    assert size == (tmp_path / "ours.npy").stat().st_size
+    save_array(tmp_path / "turned.npy", array.T)
+    np.testing.assert_array_equal(np.load(tmp_path / "turned.npy"), array.T)
+
+
+@pytest.mark.parametrize("count", [1, 1000, 1_000_000])
+def test_a_full_device_has_its_number_however_much_is_written(count):
+    with pytest.raises(OSError) as caught:
+        save_array(Path("/dev/full"), np.zeros(count, np.uint8))
+    assert caught.value.errno == errno.ENOSPC

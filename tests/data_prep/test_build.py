@@ -1,18 +1,20 @@
-import errno
 import json
 import os
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
 import torch
 from orbits import capture, even, ring, textured_capture
 
+from data_prep import pairs
 from data_prep.build import prepare
 from data_prep.frames import block_median, object_square
 from extrap_train.config import FlowMatcherConfig, PrepConfig
+from extrap_train.data import frame_files
 from extrap_train.data.store import PreparedData
 from extrap_train.depth import DepthMap, DepthSource
 from extrap_train.depth.dataset import DatasetDepth
@@ -184,18 +186,36 @@ def test_a_frame_without_depth_is_no_reference(tmp_path: Path) -> None:
     assert 6 not in data.reference_frames("cup/0000")
 
 
+@pytest.mark.parametrize(
+    ("module", "file"), [(frame_files, "IMAGES"), (frame_files, "MASKS"), (pairs, "FLOWS")]
+)
 def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    module: ModuleType, file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*_: object, **__: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(np, "save", full)
+    monkeypatch.setattr(module, file, "/dev/full")
     with pytest.raises(InputError, match=r"no space left.*MiB needed") as caught:
         run(tmp_path / "cup", captures(2))
     assert str(tmp_path / "cup") in str(caught.value)
-    assert not [path for path in (tmp_path / "cup").rglob("*") if path.is_file()]
+    made = [path for path in (tmp_path / "cup").rglob("*.npy") if path.is_file()]
+    assert len(made) == (3 if module is pairs else 0), "the frames of one sequence"
     assert not list((tmp_path / "cup").rglob("*.tmp"))
+
+
+def test_files_that_the_disk_has_cut_short_are_not_taken_for_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = frame_files.save_array
+
+    def cut_short(path: Path, array: np.ndarray) -> int:
+        size = whole(path, array)
+        os.truncate(path, size - 100)
+        return size
+
+    monkeypatch.setattr(frame_files, "save_array", cut_short)
+    with pytest.raises(InputError, match="the disk has not kept what was written"):
+        run(tmp_path / "cup", captures(2))
+    monkeypatch.undo()
+    assert run(tmp_path / "cup", captures(2)).manifest["sequences"]["kept"] == 2
 
 
 def test_the_square_follows_the_object_but_stays_inside() -> None:

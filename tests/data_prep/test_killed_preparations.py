@@ -31,7 +31,7 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def command(photographs: Path, output: Path, workers: int) -> list[str]:
     options = ["category=cup", "data=co3d", f"data.root={photographs}", f"output={output}"]
     # Never corrected, so that starting is most of what it costs.
-    fast = ["prep.image_size=16", "data.test_sequences=1", "prep.correct=false"]
+    fast = ["prep.image_size=128", "data.test_sequences=1", "prep.correct=false"]
     return [sys.executable, "-m", "data_prep", *options, *fast, f"workers={workers}"]
 
 
@@ -129,7 +129,7 @@ def test_a_full_disk_is_one_line_and_the_same_command_goes_on(
     photographs: Path, undisturbed: dict[str, bytes], tmp_path: Path
 ) -> None:
     """A file system in memory, which this process and its children alone can see."""
-    small, whole = "size=200k,mode=755", "remount,size=64m"
+    small, whole = "size=3m,mode=755", "remount,size=64m"
     if subprocess.run(["unshare", "-rm", "mount", "-t", "tmpfs", "x", str(tmp_path)]).returncode:
         pytest.skip("this machine lets nobody mount a file system of their own")
     output = tmp_path / "disk"
