@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from benchmarks.catalogue import Catalogue
-from benchmarks.table_checks import check_table
+from benchmarks.table_checks import check_table, lpips_weights_of
 from extrap_train.config import CATEGORIES
 from extrap_train.errors import InputError
 
@@ -79,6 +79,12 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("--format", choices=FORMATS, help="default: all")
     verify = command("verify", _verify, "compute every number anew from the saved images")
     verify.add_argument("results", help="folder of a table's results")
+    verify.add_argument(
+        "overrides",
+        nargs="*",
+        metavar="scoring.lpips_weights.NET=FILE",
+        help="where weights lie on this machine",
+    )
     compare = command("compare", _compare, "two result sets of one protocol, with intervals")
     compare.add_argument("before", help="folder of a table's results")
     compare.add_argument("after", help="folder of a table's results")
@@ -155,16 +161,21 @@ def _report(options: argparse.Namespace) -> int:
 
 
 def _verify(options: argparse.Namespace) -> int:
+    weights = lpips_weights_of(options.overrides)
     from benchmarks.plan import TableFolder
     from benchmarks.verify import verify
 
-    checked, problems = verify(TableFolder(Path(options.results)))
-    for problem in problems:
-        print(problem, file=sys.stderr)
-    if problems:
-        print(f"error: {len(problems)} mismatches in {options.results}", file=sys.stderr)
+    found = verify(TableFolder(Path(options.results)), weights)
+    for line in [*found.problems, *(f"{c}: not checked: {r}" for c, r in found.unchecked.items())]:
+        print(line, file=sys.stderr)
+    if found.problems:
+        print(f"error: {len(found.problems)} mismatches in {options.results}", file=sys.stderr)
         return 1
-    print(f"{checked} cells verified: every number follows from the saved images")
+    rest = f" but {', '.join(found.unchecked)}" if found.unchecked else ""
+    print(
+        f"{found.cells} cells verified: every metric{rest} follows from the saved images, and "
+        "every row from its table; times and memory are as recorded"
+    )
     return 0
 
 

@@ -18,6 +18,11 @@ _DOWNLOADS = {
 """What stands in torch's hub cache under the last part of its address."""
 
 
+def columns_of(scoring: ScoringConfig) -> list[str]:
+    """The columns that a network judges."""
+    return [*(f"lpips_{net}" for net in scoring.lpips), *(["dists"] if scoring.dists else [])]
+
+
 def judging_files(scoring: ScoringConfig) -> dict[str, Path]:
     """By column, the file that judges: the one that is named, there or not, or else the one in
     torch's hub cache. A column without either is left out.
@@ -27,8 +32,7 @@ def judging_files(scoring: ScoringConfig) -> dict[str, Path]:
         for net in scoring.lpips
         if net in scoring.lpips_weights
     }
-    columns = [*(f"lpips_{net}" for net in scoring.lpips), *(["dists"] if scoring.dists else [])]
-    cached = {column: _cached(column) for column in columns if column not in named}
+    cached = {column: _cached(column) for column in columns_of(scoring) if column not in named}
     return named | {column: file for column, file in cached.items() if file.is_file()}
 
 

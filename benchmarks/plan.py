@@ -4,6 +4,7 @@ import inspect
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -80,6 +81,20 @@ class Selection:
             and (not self.categories or draw.category in self.categories)
             and draw.sequence in order[draw.category][: self.sequences]
         ]
+
+
+def selected_draws(table: TableConfig, protocol: Protocol, quick: bool) -> list[Draw]:
+    """The draws that a run of the table takes; raises InputError where there are none."""
+    selection = Selection(tuple(table.quick.categories), table.quick.sequences)
+    draws = (selection if quick else Selection()).draws(protocol, table.draws)
+    if not draws and quick and Selection().draws(protocol, table.draws):
+        raise InputError(
+            f"quick.categories={table.quick.categories}: the table has no captures of them; give "
+            f"quick.categories={sorted({draw.category for draw in protocol.draws})}"
+        )
+    if not draws:
+        raise InputError(f"no draw of {table.draws} in the protocol; see table and rules.draws")
+    return draws
 
 
 def open_protocol(table: TableConfig, folder: TableFolder) -> tuple[Protocol, list[Capture]]:
@@ -175,10 +190,15 @@ def cell_key(hashes: Mapping[str, str]) -> str:
     return digest([hashes["images"], hashes["scoring"]])[:KEY_LENGTH]
 
 
+def method_hash(factory: str, options: Mapping[str, Any]) -> str:
+    """Of what a method's YAML and the table's options say."""
+    return digest([factory, dict(options)])
+
+
 def _require_different(methods: list[MethodConfig]) -> None:
     known: dict[str, str] = {}
     for method in methods:
-        same = known.setdefault(digest([method.factory, method.options]), method.name)
+        same = known.setdefault(method_hash(method.factory, method.options), method.name)
         if same != method.name:
             raise InputError(
                 f"methods {same} and {method.name} are the same, with the same options; leave one "
@@ -193,7 +213,7 @@ def _method_hashes(method: MethodConfig, category: str) -> dict[str, str]:
     except Unavailable as error:
         weights = f"missing: {error}"  # once they are there, the cell is another
     return {
-        "method": digest([method.factory, method.options]),
+        "method": method_hash(method.factory, method.options),
         "code": code_hash([inspect.getmodule(type(built)).__name__, "benchmarks.cells"]),  # type: ignore[union-attr]
         "weights": weights,
     }

@@ -9,11 +9,11 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from benchmarks.cells import OK, read_cell
+from benchmarks.cells import OK
 from benchmarks.columns import direction
 from benchmarks.plan import TableFolder
+from benchmarks.records import planned_cells, read_plan
 from benchmarks.scenes import Scene
-from extrap_train.data.json_files import read_json
 from extrap_train.errors import InputError
 
 RESAMPLES = 2000
@@ -37,7 +37,7 @@ class Results:
     cells: list[dict[str, Any]]
 
     @property
-    def methods(self) -> dict[str, dict[str, str]]:
+    def methods(self) -> dict[str, dict[str, Any]]:
         """Title, group and meaning of time by method, in the table's order."""
         return dict(self.plan["methods"])
 
@@ -105,22 +105,8 @@ def read_results(folder: TableFolder) -> Results:
     """
     if not folder.plan.is_file():
         raise InputError(f"{folder.path}: holds no results; `benchmark run` makes them")
-    plan = read_json(folder.plan)
-    if not isinstance(plan, dict) or not {"table", "protocol", "methods", "cells"} <= plan.keys():
-        raise InputError(f"{folder.plan}: is no table's plan; run the table again")
-    cells = []
-    for key in plan["cells"]:
-        cell = read_cell(folder.cells / key)
-        if cell is None:
-            continue
-        if cell["hashes"]["protocol"] != plan["protocol"]:
-            raise InputError(
-                f"{folder.cells / key}: is a result of another protocol "
-                f"({cell['hashes']['protocol'][:12]}, the table's is {plan['protocol'][:12]}); "
-                "remove it"
-            )
-        cells.append(cell)
-    return Results(folder, plan, cells)
+    plan = read_plan(folder.plan)
+    return Results(folder, plan, planned_cells(folder.cells, plan))
 
 
 def _ranked(part: pd.DataFrame, head: dict[str, Any]) -> list[dict[str, Any]]:

@@ -3,8 +3,9 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks.cells import OK, CellJob, read_cell
+from benchmarks.cells import OK, CellJob
 from benchmarks.plan import TableFolder
+from benchmarks.records import read_record
 from extrap_train.errors import InputError
 
 
@@ -29,7 +30,7 @@ def finished(
 
 def _record(folder: Path, say: Callable[[str], None]) -> dict[str, object] | None:
     try:
-        return read_cell(folder)
+        return read_record(folder)
     except InputError as error:
         say(f"{error}: made anew")
         return None
@@ -42,7 +43,7 @@ def _finished_images(folder: TableFolder, current: set[Path]) -> dict[str, Path]
         if cell.parent in current:
             continue
         try:
-            record = read_cell(cell.parent)
+            record = read_record(cell.parent)
         except InputError:
             continue
         if record is not None and record["status"] == OK:

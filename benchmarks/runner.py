@@ -18,11 +18,11 @@ from benchmarks.catalogue import Catalogue
 from benchmarks.cells import FAILED, OK, CellJob, died_record, run_cell
 from benchmarks.files import json_bytes
 from benchmarks.plan import (
-    Selection,
     TableFolder,
     cell_jobs,
     open_protocol,
     prepare_draws,
+    selected_draws,
 )
 from benchmarks.progress import Progress, print_plan
 from benchmarks.protocol import Protocol
@@ -88,14 +88,7 @@ def _run(
     if not methods:
         raise InputError("the table has no methods: give methods=[...]")
     protocol, captures = open_protocol(table, folder)
-    selection = Selection()
-    if options.quick:
-        selection = Selection(tuple(table.quick.categories), table.quick.sequences)
-    draws = selection.draws(protocol, table.draws)
-    if not draws:
-        raise InputError(
-            f"no draw of {table.draws} in {folder.protocol}; see table and rules.draws"
-        )
+    draws = selected_draws(table, protocol, options.quick)
     scenes = []
     with console.status("") as status:
         for number, scene in enumerate(prepare_draws(table, folder, draws, captures)):

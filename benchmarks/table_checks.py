@@ -40,6 +40,21 @@ def check_table(table: TableConfig, catalogue: Catalogue) -> None:
             )
 
 
+def lpips_weights_of(overrides: Iterable[str]) -> dict[str, str]:
+    """Files by net: what verification takes of a table's options, for they lie elsewhere on every
+    machine.
+    """
+    weights = {}
+    for word in overrides:
+        key, _, file = word.partition("=")
+        net = key.removeprefix("scoring.lpips_weights.")
+        if net == key or not file:
+            raise InputError(f"{word!r}: verification takes scoring.lpips_weights.NET=FILE alone")
+        _require_known("scoring.lpips_weights", [net], LPIPS_NETS)
+        weights[net] = file
+    return weights
+
+
 def _require_held_out(captures: CapturesConfig) -> None:
     """Behind the rendered captures for testing follow those that models are trained on."""
     usual = SyntheticConfig()

@@ -1,16 +1,21 @@
-"""Every number of a table, computed anew from the saved images and hashes."""
+"""Every metric of a table, computed anew from the saved images, and what else must follow."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
+from benchmarks.backbones import columns_of, judging_hashes
 from benchmarks.cells import OK, read_cell_files, score_cell, scores_of
-from benchmarks.plan import TableFolder, cell_key, images_hash
-from benchmarks.protocol import Protocol
+from benchmarks.plan import TableFolder
+from benchmarks.protocol import Draw, Protocol
+from benchmarks.records import table_of
 from benchmarks.report.text import tables
 from benchmarks.results import Results, read_results
 from benchmarks.scenes import Scene
 from benchmarks.scoring import Score
+from benchmarks.verify_rows import cell_problems, plan_problems, require_recorded
 from extrap_train.config import ScoringConfig
 from extrap_train.errors import InputError
 
@@ -18,60 +23,113 @@ RELATIVE_TOLERANCE = 1e-4
 """Other processors and library builds round differently."""
 
 
-def verify(folder: TableFolder) -> tuple[int, list[str]]:
-    """How many cells were checked, and what does not agree, a line each."""
+@dataclass
+class Verification:
+    """What came of it."""
+
+    cells: int = 0
+    """How many were scored again."""
+    problems: list[str] = field(default_factory=list)
+    """What does not agree, a line each."""
+    unchecked: dict[str, str] = field(default_factory=dict)
+    """Columns that this machine cannot judge as the run did, and why."""
+
+
+def verify(folder: TableFolder, lpips_weights: Mapping[str, str] | None = None) -> Verification:
+    """Check a table's results; `lpips_weights` says where weights lie on this machine, by net.
+
+    Raises InputError where there is nothing that could be checked, or a file is damaged.
+    """
     results = read_results(folder)
-    problems = [*_protocol_problems(results), *_report_problems(results)]
-    checked = 0
+    require_recorded(results)
+    scoring, unchecked = _scoring_here(results, lpips_weights or {})
+    found = Verification(unchecked=unchecked, problems=[*_report_problems(results)])
+    made: list[tuple[str, Draw]] = []
     for cell in results.cells:
+        scene = Scene.open(folder.scenes / cell["scene"])
+        made.append((cell["method"], scene.draw))
+        problems = [*cell_problems(results, cell, scene)]
         if cell["status"] == OK:
-            checked += 1
-            problems += [f"{cell['key']} ({cell['method']}): {p}" for p in _problems(results, cell)]
+            found.cells += 1
+            problems += _problems(results, cell, scene, scoring, unchecked)
+        found.problems += [f"{cell['key']} ({cell['method']}): {p}" for p in problems]
     missing = set(results.plan["cells"]) - {cell["key"] for cell in results.cells}
-    return checked, problems + [f"{key}: the cell is missing" for key in sorted(missing)]
+    found.problems += [f"{key}: the cell is missing" for key in sorted(missing)]
+    found.problems += _protocol_problems(results, made)
+    return found
 
 
-def _protocol_problems(results: Results) -> Iterator[str]:
+def _scoring_here(
+    results: Results, lpips_weights: Mapping[str, str]
+) -> tuple[ScoringConfig, dict[str, str]]:
+    """What this machine can judge as the run did, by the weights' content, and the rest with why.
+
+    A column that had no weights in the run is not judged now, and must be empty.
+    """
+    scoring = table_of(results.plan, results.folder.plan).scoring
+    there = {net: file for net, file in scoring.lpips_weights.items() if Path(file).is_file()}
+    here = replace(scoring, lpips_weights={**there, **lpips_weights})
+    hashes, stated = judging_hashes(here), results.plan["networks"]
+    unchecked = {}
+    for column, sha256 in stated.items():
+        if column not in hashes:
+            option = f"give scoring.{column.replace('lpips_', 'lpips_weights.')}=FILE"
+            cache = "put VGG-16 into torch's hub cache"
+            how = cache if column == "dists" else option
+            unchecked[column] = f"its weights are not here; {how}"
+        elif hashes[column] != sha256:
+            unchecked[column] = "the weights here are not those that it was judged with"
+    judged = {c for c in columns_of(here) if c in stated and c not in unchecked}
+    nets = [net for net in here.lpips if f"lpips_{net}" in judged]
+    return replace(here, lpips=nets, dists="dists" in judged), unchecked
+
+
+def _protocol_problems(results: Results, made: Sequence[tuple[str, Draw]]) -> Iterator[str]:
     try:
         protocol = Protocol.read(results.folder.protocol)
     except InputError as error:
         yield str(error)
         return
-    if protocol.sha256 != results.plan["protocol"]:
-        yield f"{results.folder.protocol}: is not the protocol that the results carry"
+    yield from plan_problems(results, protocol, made)
 
 
 def _report_problems(results: Results) -> Iterator[str]:
-    """Reports that are not what the cells say, of those that are there."""
+    """CSV files that are not what the cells say."""
     name = results.plan["table"]["name"]
     for file, content in tables(results, name).items():
         path = results.folder.path / file
-        if path.is_file() and path.read_bytes() != content:
+        if not path.is_file():
+            yield f"{path}: is missing; `benchmark report {name}` writes it again"
+        elif path.read_bytes() != content:
             yield f"{path}: is not what the cells say; `benchmark report {name}` writes it again"
 
 
-def _problems(results: Results, cell: dict[str, Any]) -> Iterator[str]:
-    hashes = cell["hashes"]
-    if images_hash(hashes) != hashes["images"] or cell_key(hashes) != cell["key"]:
-        yield "its name does not follow from the hashes that it states"
-    scene = Scene.open(results.folder.scenes / cell["scene"])
+def _problems(
+    results: Results,
+    cell: dict[str, Any],
+    scene: Scene,
+    scoring: ScoringConfig,
+    unchecked: Mapping[str, str],
+) -> Iterator[str]:
+    """Photographs that have changed, and numbers that do not follow from the images."""
     changed = scene.changed_files()
     if changed:
         yield f"{scene.folder / changed[0]} is not what its hash says"
         return
-    if scene.data_hash != hashes["data"]:
+    if scene.data_hash != cell["hashes"]["data"]:
         yield f"{scene.folder} holds other data than the cell was made from"
         return
     folder = results.folder.cells / cell["key"]
     pictures, points = (read_cell_files(folder, cell, kind) for kind in ("images", "points"))
-    scoring = ScoringConfig(**results.plan["table"]["scoring"])
     again = score_cell(pictures, points, scene.truth(), scoring)
     stated = scores_of(cell)
     for name in dict.fromkeys([*stated, *again]):
+        if name in unchecked:
+            continue
         if name not in stated:
             yield f"{name} is not stated, computed as {again[name].value}"
             continue
-        said, found = stated[name], again.get(name, Score(None, "the metric is not known any more"))
+        said, found = stated[name], again.get(name, Score(None, "nothing judged it"))
         if not _same(said.value, found.value):
             yield f"{name} is stated as {said.value}, computed as {found.value} {found.reason}"
         elif not _all_same(said.per_image, found.per_image):

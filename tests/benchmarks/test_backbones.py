@@ -1,15 +1,19 @@
 """Weights that appear, or change, are asked; the images that they judge are not made again."""
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
+import lpips
 import pytest
 import torch
 from torchvision.models import squeezenet1_1
 
 from benchmarks import scoring
+from benchmarks.__main__ import main
 from benchmarks.backbones import _DOWNLOADS, judging_files
 from benchmarks.results import read_results
+from benchmarks.verify import Verification, verify
 from extrap_train.config import LPIPS_NETS, ScoringConfig
 from extrap_train.errors import InputError
 from extrap_train.metrics import dists_distance, lpips_distance
@@ -79,3 +83,34 @@ def test_a_named_file_stands_before_the_cached_one(hub: Path) -> None:
         "lpips_squeeze": hub / "squeezenet1_1-b8a52dc0.pth",
         "dists": hub / "vgg16-397923af.pth",
     }
+
+
+def test_verification_judges_with_the_very_weights_or_says_that_it_did_not(
+    own: Path, hub: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    weights = tmp_path / "lpips.pt"
+    torch.save(lpips.LPIPS(net="squeeze", pnet_rand=True, verbose=False).state_dict(), weights)
+    words = ["scoring.lpips=[squeeze]", f"scoring.lpips_weights.squeeze={weights}"]
+    assert run_greys(own, tmp_path, *words, quick=True) == 0
+    folder = greys_folder(tmp_path)
+    assert verify(folder) == Verification(cells=2)
+    moved = weights.rename(tmp_path / "elsewhere.pt")
+    here = {"lpips_squeeze": "its weights are not here; give scoring.lpips_weights.squeeze=FILE"}
+    assert verify(folder) == Verification(cells=2, unchecked=here)
+    assert verify(folder, {"squeeze": str(moved)}) == Verification(cells=2)
+    _put_backbone(hub, seed=0)
+    assert "not those" in verify(folder).unchecked["lpips_squeeze"]
+    capsys.readouterr()
+    assert main(["verify", str(folder.path)]) == 0
+    said = capsys.readouterr()
+    assert "every metric but lpips_squeeze follows from the saved images" in said.out
+    assert "lpips_squeeze: not checked: the weights here are not those" in said.err
+    option = f"scoring.lpips_weights.squeeze={moved}"
+    file = next(folder.cells.glob("*/cell.json"))
+    record = json.loads(file.read_text())
+    record["metrics"]["lpips_squeeze"]["value"] += 0.1
+    file.write_text(json.dumps(record))
+    assert main(["verify", str(folder.path), option]) == 1
+    assert "lpips_squeeze is stated as" in capsys.readouterr().err
+    assert main(["verify", str(folder.path), "rules.pool=9"]) == 1
+    assert "takes scoring.lpips_weights.NET=FILE alone" in capsys.readouterr().err

@@ -7,14 +7,14 @@ import pandas as pd
 import pytest
 
 from benchmarks.__main__ import main
-from benchmarks.verify import verify
+from benchmarks.verify import Verification, verify
 from extrap_train.errors import InputError
 from tests.benchmarks.tables import greys_folder, run_greys
 
 
 def test_a_changed_picture_is_noticed(own: Path, copy: Path) -> None:
     folder = greys_folder(copy)
-    assert verify(folder) == (4, [])
+    assert verify(folder) == Verification(cells=4, unchecked={})
     picture = next(copy.glob("greys/cells/*/0.png"))
     picture.write_bytes(picture.read_bytes()[:-1] + b"!")
     with pytest.raises(InputError, match="not what its cell's hash says"):
@@ -28,13 +28,13 @@ def test_verify_finds_a_forged_number_truth_and_protocol(copy: Path) -> None:
     record = json.loads(file.read_text())
     record["metrics"]["psnr"]["value"] += 0.5
     file.write_text(json.dumps(record))
-    assert any("psnr is stated as" in problem for problem in verify(folder)[1])
+    assert any("psnr is stated as" in problem for problem in verify(folder).problems)
     mask = next(copy.glob("greys/scenes/*/masks/0.png"))
     mask.write_bytes(next(copy.glob("greys/scenes/*/truth/0.png")).read_bytes())
-    assert any("masks/0.png is not what its hash says" in p for p in verify(folder)[1])
+    assert any("masks/0.png is not what its hash says" in p for p in verify(folder).problems)
     protocol = folder.protocol.read_text()
     folder.protocol.write_text(protocol.replace('"pool": 9', '"pool": 8'))
-    assert any("not what its hash" in problem for problem in verify(folder)[1])
+    assert any("not what its hash" in problem for problem in verify(folder).problems)
 
 
 def test_verify_finds_what_is_left_out_and_what_only_pictures_show(copy: Path) -> None:
@@ -48,7 +48,7 @@ def test_verify_finds_what_is_left_out_and_what_only_pictures_show(copy: Path) -
         file.write_text(json.dumps(record))
     table = folder.path / "greys_mean.csv"
     table.write_text(table.read_text().replace("dark", "best"))
-    said = "\n".join(verify(folder)[1])
+    said = "\n".join(verify(folder).problems)
     assert "masked_psnr is not stated, computed as" in said
     assert "psnr by image is stated as" in said
     assert "its name does not follow from the hashes" in said
@@ -63,7 +63,7 @@ def test_geometry_is_scored_kept_and_verified(own: Path, copy: Path) -> None:
     assert (table["solid", "accuracy_distance"] > 0.01).all()
     assert table["dark", "f_score"].isna().all()
     folder = greys_folder(copy)
-    assert verify(folder) == (4, [])
+    assert verify(folder) == Verification(cells=4, unchecked={})
     cloud = next(copy.glob("greys/cells/*/points.npy"))
     cloud.write_bytes(cloud.read_bytes()[:-1] + b"!")
     with pytest.raises(InputError, match="not what its cell's hash says"):

@@ -1,0 +1,134 @@
+"""A row is what it is called: relabelled, dropped and damaged results are noticed."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks.__main__ import main
+from benchmarks.verify import verify
+from extrap_train.errors import InputError
+from tests.benchmarks.tables import greys_folder
+
+Edit = Callable[[dict[str, Any]], Any]
+
+
+def _edit(file: Path, edit: Edit) -> None:
+    content = json.loads(file.read_text())
+    edit(content)
+    file.write_text(json.dumps(content))
+
+
+def _cell_of(copy: Path, method: str) -> Path:
+    files = copy.glob("greys/cells/*/cell.json")
+    return next(file for file in files if json.loads(file.read_text())["method"] == method)
+
+
+def test_a_result_under_another_name_is_noticed(copy: Path) -> None:
+    """Everything that is scored stays as it was; only what it is called changes."""
+    light = json.loads(_cell_of(copy, "light").read_text())["options"]
+    relabelled = {"method": "light", "options": light, "n_views": 6, "category": "chair"}
+    file = _cell_of(copy, "dark")
+    _edit(file, lambda cell: cell.update(relabelled, seed=1, device="cuda"))
+    said = "\n".join(verify(greys_folder(copy)).problems)
+    assert "was not made by grey_method.Grey with the options of its row" in said
+    assert "states n_views 6, its photographs are of 3" in said
+    assert "states category chair, its photographs are of apple" in said
+    assert "states seed 1, its photographs are of 0" in said
+    assert "states the device cuda, made on cpu" in said
+    assert "dark on apple-000" in said
+    assert "there is no cell of it" in said
+    assert "has 2 cells" in said
+
+
+def test_options_of_a_row_that_the_images_were_not_made_with_are_noticed(copy: Path) -> None:
+    folder = greys_folder(copy)
+    _edit(_cell_of(copy, "dark"), lambda cell: cell["options"].update(level=0.9))
+    assert any("its row has {'level': 0.2" in problem for problem in verify(folder).problems)
+    _edit(folder.plan, lambda plan: plan["methods"]["dark"]["options"].update(level=0.9))
+    assert sum("was not made by" in problem for problem in verify(folder).problems) == 2
+    _edit(folder.plan, lambda plan: plan["table"]["options"].update(light={"level": 0.7}))
+    said = "\n".join(verify(folder).problems)
+    assert "light was not made with the options that its table gives" in said
+
+
+def test_a_cell_that_the_plan_has_lost_is_missed(copy: Path) -> None:
+    folder = greys_folder(copy)
+    _edit(folder.plan, lambda plan: plan["cells"].pop())
+    problems = verify(folder).problems
+    assert sum("there is no cell of it" in problem for problem in problems) == 1
+    _edit(folder.plan, lambda plan: plan["methods"].pop("light"))
+    with pytest.raises(InputError, match="is of light, and the table has no such row"):
+        verify(folder)
+
+
+def test_a_missing_csv_file_is_noticed(copy: Path) -> None:
+    (greys_folder(copy).path / "greys_images.csv").unlink()
+    (problem,) = verify(greys_folder(copy)).problems
+    assert "greys_images.csv: is missing; `benchmark report greys` writes it" in problem
+
+
+def test_a_plan_that_does_not_say_what_made_its_rows_is_refused(copy: Path) -> None:
+    _edit(greys_folder(copy).plan, lambda plan: plan["methods"]["dark"].pop("factory"))
+    with pytest.raises(InputError, match=r"plan\.json: does not say what made its rows"):
+        verify(greys_folder(copy))
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        lambda plan: plan.update(table={}),
+        lambda plan: plan.update(table=[]),
+        lambda plan: plan["table"].update(name="../elsewhere"),
+        lambda plan: plan["table"].update(captures=3),
+        lambda plan: plan["table"].update(unknown=3),
+        lambda plan: plan.update(cells=[3]),
+        lambda plan: plan.update(cells=["../../elsewhere"]),
+        lambda plan: plan.update(cells=2 * plan["cells"]),
+        lambda plan: plan.update(methods={"dark": "dark"}),
+        lambda plan: plan.update(protocol=None),
+        lambda plan: plan.pop("quick"),
+    ],
+)
+def test_a_damaged_plan_is_one_line(
+    edit: Edit, copy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _edit(greys_folder(copy).plan, edit)
+    assert main(["verify", str(greys_folder(copy).path)]) == 1
+    _require_line(capsys.readouterr().err, "plan.json: is no table's plan")
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        lambda cell: cell.update(hashes={}),
+        lambda cell: cell["hashes"].pop("images"),
+        lambda cell: cell.update(hashes=[]),
+        lambda cell: cell.update(images=[]),
+        lambda cell: cell.update(images={"../0.png": ""}),
+        lambda cell: cell.update(points=3),
+        lambda cell: cell.update(metrics={"psnr": 3.0}),
+        lambda cell: cell["metrics"]["psnr"].update(per_image=3),
+        lambda cell: cell["metrics"]["psnr"].update(other=3),
+        lambda cell: cell.update(seconds="3"),
+        lambda cell: cell.update(scene="../scenes"),
+        lambda cell: cell.update(n_views="3"),
+        lambda cell: cell.update(status="fine"),
+        lambda cell: cell.update(status=[]),
+        lambda cell: cell.pop("options"),
+    ],
+)
+def test_a_damaged_cell_is_one_line(
+    edit: Edit, copy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _edit(_cell_of(copy, "dark"), edit)
+    assert main(["verify", str(greys_folder(copy).path)]) == 1
+    _require_line(capsys.readouterr().err, "cell.json: is no record of this cell")
+
+
+def _require_line(message: str, said: str) -> None:
+    assert message.startswith("error: ")
+    assert message.count("\n") == 1
+    assert said in message
