@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
+from tqdm.contrib.logging import logging_redirect_tqdm
 
 from data_prep.correct import METHOD as CORRECTION_METHOD
 from data_prep.filter import judge_all
@@ -187,15 +188,22 @@ def _make_all(plan: _Plan, launcher: Launcher, progress: bool) -> tuple[list[Out
             return outcomes, split
         done = launcher.run(prepare_unit, units)
         bar = tqdm(done, "preparing", len(units), unit="sequence", disable=not progress)
-        for index, reason in bar:
-            unit = units[index]
-            made[unit.name] = unit.role
-            if reason:
-                reason = reason.reason if isinstance(reason, Died) else reason
-                number = kept[unit.name]
-                verdict = replace(outcomes[number].verdict, kept=False, reason=reason)
-                outcomes[number] = replace(outcomes[number], verdict=verdict, failed=True)
-                LOG.warning("left out: %s", reason)
+        with logging_redirect_tqdm():
+            for index, reason in bar:
+                unit = units[index]
+                made[unit.name] = unit.role
+                if reason:
+                    number = kept[unit.name]
+                    outcomes[number] = _left_out(outcomes[number], reason)
+
+
+def _left_out(outcome: Outcome, reason: str | Died) -> Outcome:
+    """What becomes of a sequence that could not be prepared; says so."""
+    if isinstance(reason, Died):
+        reason = f"sequence {outcome.name}: {reason.reason}"
+    LOG.warning("left out: %s", reason)
+    verdict = replace(outcome.verdict, kept=False, reason=reason)
+    return replace(outcome, verdict=verdict, failed=True)
 
 
 def _nothing_left(outcomes: list[Outcome]) -> str:

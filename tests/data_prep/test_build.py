@@ -19,6 +19,7 @@ from extrap_train.data.store import PreparedData
 from extrap_train.depth import DepthMap, DepthSource
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError
+from extrap_train.jobs import Died
 from extrap_train.views import View
 
 OPTIONS = PrepConfig(image_size=16)
@@ -268,3 +269,21 @@ def test_a_lone_sequence_shows_how_far_its_pairs_are(
 def test_photographs_too_close_together_make_no_pair(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="make a training pair"):
         run(tmp_path / "cup", [capture(ring(even(9, 6)))])
+
+
+class Fatal:
+    """A launcher whose first job never comes back."""
+
+    def run(self, job, items):
+        yield 0, Died("its process was killed")
+        yield from ((index, job(items[index])) for index in range(1, len(items)))
+
+
+def test_a_sequence_whose_process_died_is_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    arguments = {"test_names": 1, "folder": tmp_path / "cup", "progress": False}
+    data = prepare(captures(3), DatasetDepth(), OPTIONS, launcher=Fatal(), **arguments)
+    reason = data.sequences.set_index("sequence").loc["cup/0000", "reason"]
+    assert reason == "sequence cup/0000: its process was killed"
+    assert f"left out: {reason}" in caplog.text

@@ -2,6 +2,8 @@
 
 import logging
 import shutil
+import subprocess
+import sys
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
 from pathlib import Path
@@ -151,3 +153,28 @@ def test_a_sequence_without_depth_is_not_sent_where_it_comes_from(
     sequence = capture(ring(even(12)), "black")
     with pytest.raises(InputError, match=f"no depth is known in any of its frames; {advice}"):
         make_frames(sequence, source, 16, lone=False)
+
+
+@pytest.mark.parametrize(
+    ("module", "alone"), [("data_prep", "workers"), ("extrap_train", "threads")]
+)
+def test_the_command_line_says_what_it_leaves_out(
+    module: str, alone: str, photographs: Path, tmp_path: Path
+) -> None:
+    for name in NAMES:
+        shutil.rmtree(photographs / "cup" / name / "depths")
+    options = [
+        "category=cup",
+        "data=co3d",
+        f"data.root={photographs}",
+        f"output={tmp_path / 'out'}",
+    ]
+    command = [sys.executable, "-m", module, *options, f"{alone}=1", "prep.max_gap_deg=10"]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert run.returncode == 1
+    lines = [line for part in run.stderr.splitlines() for line in part.split("\r") if line.strip()]
+    said = [line for line in lines if not line.startswith("preparing:")]
+    assert said[0].startswith("no sequence is a full circle (azimuth gap 30° > 10°)")
+    for line, name in zip(said[1:-1], sorted(NAMES), strict=True):
+        assert line.startswith(f"left out: sequence cup/{name}: 12 of 12 frames cannot be used")
+    assert said[-1].startswith(f"error: none of the {len(NAMES)} sequences of cup can be used")
