@@ -3,13 +3,13 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from benchmarks.files import read_points
 from benchmarks.protocol import Draw, Protocol, draw_sequence
+from benchmarks.scenes import TrueSurface
 from data_prep.filter import judge_all
 from data_prep.split import split_sequences
 from extrap_train.config import CapturesConfig, PrepConfig, RulesConfig, SyntheticConfig
@@ -27,15 +27,6 @@ from extrap_train.views import stack_poses
 
 CLOUD_POINTS = 20_000
 """Of the true surface of a rendered scene."""
-
-
-@dataclass(frozen=True)
-class TrueSurface:
-    """Points of what a capture shows, in world units."""
-
-    object: Float[Tensor, "m 3"]
-    surroundings: Float[Tensor, "k 3"]
-    """Ground and the like: not asked for, and no error."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +129,7 @@ def _given_draws(config: CapturesConfig, capture: Sequence, rules: RulesConfig) 
         content = read_json(file)
         try:
             inputs, targets = (
-                tuple(capture.frames[int(i)].name for i in require_list(content[key], key, file))
+                _frames_of(capture, require_list(content[key], key, file))
                 for key in ("train_ids", "test_ids")
             )
         except (KeyError, IndexError, TypeError, ValueError) as error:
@@ -147,8 +138,20 @@ def _given_draws(config: CapturesConfig, capture: Sequence, rules: RulesConfig) 
             raise InputError(
                 f"{file}: names no frames of {capture.name} ({error!r}); get it again"
             ) from None
+        if set(inputs) & set(targets):
+            raise InputError(f"{file}: has frames in both train_ids and test_ids; get it again")
         draws.append(Draw(capture.category, capture.name, n_views, "given", 0, inputs, targets))
     return draws
+
+
+def _frames_of(capture: Sequence, ids: list[Any]) -> tuple[str, ...]:
+    """The names of frames by their places; ValueError where those cannot be meant."""
+    wrong = [i for i in ids if type(i) is not int or not 0 <= i < len(capture.frames)]
+    if wrong:
+        raise ValueError(f"{wrong[0]!r} is no number from 0 to {len(capture.frames) - 1}")
+    if len(set(ids)) < len(ids):
+        raise ValueError("a number stands twice")
+    return tuple(capture.frames[i].name for i in ids)
 
 
 def _named(spec: str, categories: list[str]) -> Sequence:

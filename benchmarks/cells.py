@@ -5,7 +5,6 @@ whole or not at all; a finished one is never changed.
 """
 
 import hashlib
-import io
 import os
 import shutil
 import traceback
@@ -14,31 +13,23 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image
 from torch import Tensor
 
-from benchmarks.files import json_bytes
-from benchmarks.memory import PeakMemory
-from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis, Unavailable
-from benchmarks.methods.build import build_method
+from benchmarks.files import images_of, json_bytes
+from benchmarks.making import MEASURED, Made, make
+from benchmarks.methods.base import Unavailable
 from benchmarks.provenance import versions
-from benchmarks.recorded_depth import RecordedDepth
-from benchmarks.scenes import Scene, Truth, npy_bytes, png_bytes
-from benchmarks.scoring import Score, score_images, score_points
+from benchmarks.scenes import Scene
+from benchmarks.scoring import Score, score_files
 from extrap_train.config import MethodConfig, ScoringConfig
 from extrap_train.data.files import write_whole
 from extrap_train.data.json_files import read_json
 from extrap_train.errors import InputError
-from extrap_train.metrics import require_unit_range
 
 OK, FAILED, UNAVAILABLE = "ok", "failed", "unavailable"
 _DRAW = ("category", "sequence", "n_views", "draw", "seed")
-_MEASURED = ("seconds", "wall_seconds", "peak_memory_mib", "given", "counts")
-PER_IMAGE = "per image"
-"""`MethodConfig.time` of the methods whose perform time is that of one image."""
 
 
 @dataclass(frozen=True)
@@ -66,15 +57,19 @@ def run_cell(job: CellJob) -> dict[str, Any]:
         os.environ["CUDA_VISIBLE_DEVICES"] = ""
     scene = Scene.open(job.scene)
     record = _head(job, scene)
-    pictures: dict[str, bytes] = {}
-    points: dict[str, bytes] = {}
+    files: dict[str, bytes] = {}
     try:
-        made, pictures, points = _made(job, scene)
-        record |= {"status": OK, "reason": "", **made}
-        scores = score_cell(pictures, points, scene.truth(), job.scoring)
-        record["metrics"] = {name: asdict(score) for name, score in scores.items()}
-        record["images"] = {name: hashlib.sha256(c).hexdigest() for name, c in pictures.items()}
-        record["points"] = {name: hashlib.sha256(c).hexdigest() for name, c in points.items()}
+        made = _made(job, scene)
+        scores = score_files(made.images, made.points, scene.truth(), job.scoring)
+        record |= {
+            "status": OK,
+            "reason": "",
+            **made.measured,
+            "metrics": {name: asdict(score) for name, score in scores.items()},
+            "images": _hashes(made.images),
+            "points": _hashes(made.points),
+        }
+        files = made.images | made.points
     except Unavailable as error:
         record |= {"status": UNAVAILABLE, "reason": str(error)}
     except Exception as error:
@@ -83,17 +78,12 @@ def run_cell(job: CellJob) -> dict[str, Any]:
             "reason": f"{type(error).__name__}: {' '.join(str(error).split())[:300]}",
             "traceback": traceback.format_exc(),
         }
-    write_cell(job.folder, record, pictures | points if record["status"] == OK else {})
+    write_cell(job.folder, record, files)
     return record
 
 
-def score_cell(
-    pictures: Mapping[str, bytes], points: Mapping[str, bytes], truth: Truth, scoring: ScoringConfig
-) -> dict[str, Score]:
-    """Every metric of a cell from its files."""
-    images = score_images(read_images_from(pictures), truth, scoring)
-    clouds = [torch.from_numpy(np.load(io.BytesIO(content))) for content in points.values()]
-    return images | score_points(clouds[0] if clouds else None, truth)
+def _hashes(files: Mapping[str, bytes]) -> dict[str, str]:
+    return {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
 
 
 def read_cell_files(folder: Path, record: Mapping[str, Any], kind: str) -> dict[str, bytes]:
@@ -122,58 +112,20 @@ def _head(job: CellJob, scene: Scene) -> dict[str, Any]:
     }
 
 
-def _made(job: CellJob, scene: Scene) -> tuple[dict[str, Any], dict[str, bytes], dict[str, bytes]]:
-    """What was measured while the images were made, the images as files, and the points as one,
-    where the method has any.
-    """
-    if job.images_from is not None:
-        before = read_json(job.images_from / "cell.json")
-        pictures, points = (
-            read_cell_files(job.images_from, before, kind) for kind in ("images", "points")
-        )
-        return {name: before[name] for name in _MEASURED}, pictures, points
-    inputs = scene.inputs()
-    with PeakMemory() as memory, Stopwatch() as watch:
-        synthesis = _synthesize(job, inputs)
-    pictures = {f"{i}.png": png_bytes(image) for i, image in enumerate(synthesis.images)}
-    made = {
-        "seconds": synthesis.seconds + _depth_share(inputs, job.method),
-        "wall_seconds": watch.seconds,
-        "peak_memory_mib": memory.mib,
-        "given": dict(synthesis.given),
-        "counts": dict(synthesis.counts),
-    }
-    points = {} if synthesis.points is None else {"points.npy": npy_bytes(synthesis.points)}
-    return made, pictures, points
-
-
-def _synthesize(job: CellJob, inputs: SceneInputs) -> Synthesis:
-    torch.manual_seed(inputs.seed)
-    synthesis = build_method(job.method).synthesize(inputs)
-    wanted = (len(inputs.targets.world_to_cam), 3, inputs.targets.height, inputs.targets.width)
-    if tuple(synthesis.images.shape) != wanted:
-        found = tuple(synthesis.images.shape)
-        raise InputError(f"method {job.method.name}: made images {found}, asked were {wanted}")
-    require_unit_range(synthesis.images)
-    return synthesis
-
-
-def _depth_share(inputs: SceneInputs, method: MethodConfig) -> float:
-    """What finding the inputs' depth took, for the methods that asked for it."""
-    assert isinstance(inputs.depth_source, RecordedDepth)
-    count = len(inputs.targets.world_to_cam) if method.time == PER_IMAGE else 1
-    return inputs.depth_source.seconds / count
-
-
-def read_images_from(pictures: Mapping[str, bytes]) -> Float[Tensor, "n 3 h w"]:
-    """The images as their files hold them: 8 bits."""
-    arrays = [np.array(Image.open(io.BytesIO(content))) for content in pictures.values()]
-    return torch.from_numpy(np.stack(arrays)).permute(0, 3, 1, 2).float() / 255
+def _made(job: CellJob, scene: Scene) -> Made:
+    if job.images_from is None:
+        return make(job.method, scene)
+    before = read_json(job.images_from / "cell.json")
+    return Made(
+        {name: before[name] for name in MEASURED},
+        read_cell_files(job.images_from, before, "images"),
+        read_cell_files(job.images_from, before, "points"),
+    )
 
 
 def read_cell_images(folder: Path, record: Mapping[str, Any]) -> Float[Tensor, "n 3 h w"]:
     """The saved images of a finished cell, in the targets' order."""
-    return read_images_from(read_cell_files(folder, record, "images"))
+    return images_of(read_cell_files(folder, record, "images").values())
 
 
 def write_cell(folder: Path, record: Mapping[str, Any], files: Mapping[str, bytes]) -> None:
@@ -208,7 +160,7 @@ def _is_whole(record: Mapping[str, Any]) -> bool:
     """Whether it has every entry that is read from a cell of its status."""
     needed = {"method", "status", "reason", "scene", "device", "hashes", *_DRAW}
     if record.get("status") == OK:
-        needed |= {"metrics", "images", "points", *_MEASURED}
+        needed |= {"metrics", "images", "points", *MEASURED}
     return needed <= record.keys()
 
 

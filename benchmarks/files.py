@@ -1,21 +1,52 @@
-"""Files as results are written and read: JSON of the same bytes for the same content, clouds."""
+"""Files as results are written and read: JSON of the same bytes for the same content, pictures,
+clouds.
+"""
 
+import io
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from PIL import Image
 from plyfile import PlyData, PlyParseError
 from torch import Tensor
 
+from extrap_train.data.images import to_eight_bits
 from extrap_train.errors import InputError
 
 
 def json_bytes(content: Any) -> bytes:
     """Indented, with a last line end; NaN is refused, since JSON has none."""
     return (json.dumps(content, indent=1, allow_nan=False) + "\n").encode()
+
+
+def png_bytes(image: Float[Tensor, "3 h w"]) -> bytes:
+    """An image in [0, 1] as an 8-bit PNG."""
+    content = io.BytesIO()
+    Image.fromarray(to_eight_bits(image.permute(1, 2, 0))).save(content, "png")
+    return content.getvalue()
+
+
+def images_of(pictures: Iterable[bytes]) -> Float[Tensor, "n 3 h w"]:
+    """Images of one size as their files hold them: 8 bits, here in [0, 1]."""
+    arrays = [np.array(Image.open(io.BytesIO(content))) for content in pictures]
+    return torch.from_numpy(np.stack(arrays)).permute(0, 3, 1, 2).float() / 255
+
+
+def npy_bytes(values: Tensor) -> bytes:
+    """An array in single precision."""
+    content = io.BytesIO()
+    np.save(content, values.float().numpy())
+    return content.getvalue()
+
+
+def array_of(content: bytes) -> Tensor:
+    """The array that a file of `npy_bytes` holds."""
+    return torch.from_numpy(np.load(io.BytesIO(content)))
 
 
 def read_points(path: Path) -> Float[Tensor, "m 3"]:

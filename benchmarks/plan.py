@@ -15,7 +15,8 @@ from benchmarks.fingerprint import code_hash, weights_hash
 from benchmarks.methods.base import Unavailable
 from benchmarks.methods.build import build_method
 from benchmarks.protocol import Draw, Protocol, digest
-from benchmarks.scenes import Scene, prepare_scene
+from benchmarks.scene_writing import prepare_scene
+from benchmarks.scenes import Scene
 from extrap_train.config import MethodConfig, TableConfig
 from extrap_train.data.frame_files import sequence_folder
 from extrap_train.errors import InputError
@@ -128,7 +129,7 @@ def prepare_draws(
 ) -> Iterable[Scene]:
     """Every draw's folder, one after another, made where it is missing or of another origin."""
     by_name = {(c.sequence.category, c.sequence.name): c for c in captures}
-    code = code_hash(["benchmarks.scenes"])
+    code = code_hash(["benchmarks.scene_writing"])
     for draw in draws:
         origin = digest([code, asdict(table.captures), asdict(table.rules), asdict(draw)])
         capture = by_name[draw.category, draw.sequence]
@@ -213,8 +214,13 @@ def _method_hashes(method: MethodConfig, category: str) -> dict[str, str]:
     except Unavailable as error:
         weights = f"missing: {error}"  # once they are there, the cell is another
     return {
+<<<<<<< HEAD
         "method": method_hash(method.factory, method.options),
         "code": code_hash([inspect.getmodule(type(built)).__name__, "benchmarks.cells"]),  # type: ignore[union-attr]
+=======
+        "method": digest([method.factory, method.options]),
+        "code": code_hash([inspect.getmodule(type(built)).__name__, "benchmarks.making"]),  # type: ignore[union-attr]
+>>>>>>> 3f57cfd (What makes a cell's images stands apart from what scores them)
         "weights": weights,
     }
 

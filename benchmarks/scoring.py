@@ -14,6 +14,7 @@ from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from benchmarks.consistency import tsed, warp_psnr
+from benchmarks.files import array_of, images_of
 from benchmarks.scenes import Truth
 from extrap_train.config import ScoringConfig
 from extrap_train.errors import InputError
@@ -67,6 +68,15 @@ def score_images(
         | megascenes_compat(images, truth)
         | _consistency(images, truth)
     )
+
+
+def score_files(
+    images: Mapping[str, bytes], points: Mapping[str, bytes], truth: Truth, scoring: ScoringConfig
+) -> dict[str, Score]:
+    """Every metric of a cell from its files."""
+    clouds = [array_of(content) for content in points.values()]
+    scores = score_images(images_of(images.values()), truth, scoring)
+    return scores | score_points(clouds[0] if clouds else None, truth)
 
 
 def score_points(points: Float[Tensor, "m 3"] | None, truth: Truth) -> dict[str, Score]:

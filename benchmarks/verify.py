@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.backbones import columns_of, judging_hashes
-from benchmarks.cells import OK, read_cell_files, score_cell, scores_of
+from benchmarks.cells import OK, read_cell_files, scores_of
 from benchmarks.plan import TableFolder
 from benchmarks.protocol import Draw, Protocol
 from benchmarks.records import table_of
 from benchmarks.report.text import tables
 from benchmarks.results import Results, read_results
 from benchmarks.scenes import Scene
-from benchmarks.scoring import Score
+from benchmarks.scoring import Score, score_files
 from benchmarks.verify_rows import cell_problems, plan_problems, require_recorded
 from extrap_train.config import ScoringConfig
 from extrap_train.errors import InputError
@@ -121,7 +121,7 @@ def _problems(
         return
     folder = results.folder.cells / cell["key"]
     pictures, points = (read_cell_files(folder, cell, kind) for kind in ("images", "points"))
-    again = score_cell(pictures, points, scene.truth(), scoring)
+    again = score_files(pictures, points, scene.truth(), scoring)
     stated = scores_of(cell)
     for name in dict.fromkeys([*stated, *again]):
         if name in unchecked:

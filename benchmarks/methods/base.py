@@ -69,6 +69,11 @@ class Synthesis:
     """Further numbers for the result's row, e.g. `{"gaussians": 51234}`."""
 
 
+def photographs_used(views: Sequence[View]) -> dict[str, str]:
+    """For `Synthesis.given`: at what size the method took the inputs."""
+    return {"photographs": f"{views[0].camera.width} px"}
+
+
 @runtime_checkable
 class Method(Protocol):
     """One row of a table."""

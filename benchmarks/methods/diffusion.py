@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis, Unavailable
+from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis, Unavailable, photographs_used
 from benchmarks.methods.checks import check_range
 from benchmarks.methods.references import views_with_depth
 from extrap_train.config import SamplerConfig
@@ -81,6 +81,7 @@ class Diffusion:
             made = self.painted(model, inputs)
         size = (inputs.targets.height, inputs.targets.width)
         given = {"weights": folder.name, "depth": "used" if self.family != "zeronvs" else "scale"}
+        given |= photographs_used(inputs.fine_views)
         if made.images.shape[-2:] != size:
             given["made at"] = f"{made.images.shape[-1]} px"
         return Synthesis(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis
+from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis, photographs_used
 from benchmarks.methods.references import nearest_inputs, views_with_depth
 from extrap_train.data.module import with_warp
 from extrap_train.data.queries import query_batch
@@ -26,7 +26,11 @@ class NearestPhoto:
         with Stopwatch() as watch:
             chosen = [inputs.views[row[0]].image for row in nearest_inputs(inputs, 1)]
             images = torch.stack(chosen)
-        return Synthesis(images, watch.seconds / len(images), {"depth": "not used"})
+        return Synthesis(
+            images,
+            watch.seconds / len(images),
+            {"depth": "not used"} | photographs_used(inputs.views),
+        )
 
 
 @dataclass(frozen=True)
@@ -48,4 +52,4 @@ class InpaintedWarp:
             batch = with_warp(batch, size)
             assert batch.warp is not None
             images = inpainted_warp(batch.warp).clamp(0, 1)
-        return Synthesis(images, watch.seconds / len(images))
+        return Synthesis(images, watch.seconds / len(images), photographs_used(views))

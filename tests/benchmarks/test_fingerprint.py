@@ -37,3 +37,17 @@ def test_a_neighbour_that_is_imported_by_its_place_counts(
         changed = _fresh_hash("own_package.method") != before
         assert changed == (name != "unused.py"), name
         (folder / name).write_text(files[name])
+
+
+def test_images_do_not_hang_on_how_they_are_scored(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+    source = fingerprint._source
+
+    def spied(module: str) -> Path | None:
+        asked.append(module)
+        return source(module)
+
+    monkeypatch.setattr(fingerprint, "_source", spied)
+    fingerprint.code_hash(["benchmarks.making"])
+    assert "benchmarks.scenes" in asked
+    assert not {"benchmarks.scoring", "benchmarks.consistency", "benchmarks.captures"} & {*asked}

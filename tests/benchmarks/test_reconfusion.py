@@ -61,7 +61,16 @@ def test_ids_count_the_frames_in_name_order(root: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "content", ['{"train_ids": [0, 99], "test_ids": [1]}', '{"train_ids": [0]}', "{"]
+    "content",
+    [
+        '{"train_ids": [0, 99], "test_ids": [1]}',
+        '{"train_ids": [0, -1], "test_ids": [1]}',
+        '{"train_ids": [0, 1.9], "test_ids": [2]}',
+        '{"train_ids": [0, 0], "test_ids": [1]}',
+        '{"train_ids": [0, 1], "test_ids": [2, 1]}',
+        '{"train_ids": [0]}',
+        "{",
+    ],
 )
 def test_a_damaged_split_is_named(root: Path, content: str) -> None:
     file = root / "34_1479_4753" / "train_test_split_3.json"

@@ -9,7 +9,8 @@ import torch
 
 from benchmarks.captures import Capture
 from benchmarks.protocol import Draw, draw_sequence
-from benchmarks.scenes import Scene, prepare_scene
+from benchmarks.scene_writing import prepare_scene
+from benchmarks.scenes import Scene
 from extrap_train.config import RulesConfig
 from extrap_train.errors import InputError
 from extrap_train.metrics import psnr
@@ -85,6 +86,16 @@ def test_what_is_there_is_used_and_what_was_touched_made_anew(
     assert again.data_hash == scene.data_hash
     assert not again.changed_files()
     assert prepare_scene(folder, capture, draw, _RULES, "other").record["origin"] == "other"
+
+
+@pytest.mark.parametrize("damaged", ['{"form', '{"format": 2}', "[]"])
+def test_a_damaged_record_is_no_scene_and_made_anew(
+    draw_and_scene: tuple[Draw, Scene], damaged: str
+) -> None:
+    draw, scene = draw_and_scene
+    (scene.folder / "scene.json").write_text(damaged)
+    again = prepare_scene(scene.folder, Capture(analytic_capture(size=64)), draw, _RULES, "origin")
+    assert again.data_hash == scene.data_hash
 
 
 def test_a_frame_that_the_capture_lacks_is_named(tmp_path: Path) -> None:

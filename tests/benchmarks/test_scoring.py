@@ -8,8 +8,7 @@ import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio
 
-from benchmarks.captures import TrueSurface
-from benchmarks.scenes import Truth
+from benchmarks.scenes import TrueSurface, Truth
 from benchmarks.scoring import megascenes_compat, score_images, score_points
 from extrap_train.config import ScoringConfig
 from extrap_train.views import stack_cameras

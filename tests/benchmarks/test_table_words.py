@@ -8,7 +8,7 @@ from benchmarks import table_checks
 from benchmarks.__main__ import main
 from benchmarks.catalogue import Catalogue
 from benchmarks.results import read_results
-from benchmarks.scenes import DEPTHS
+from benchmarks.scene_writing import DEPTHS
 from extrap_train.errors import InputError
 from tests.benchmarks.tables import greys_folder, run_greys, write_own
 

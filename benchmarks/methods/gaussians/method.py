@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis
+from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis, photographs_used
 from benchmarks.methods.gaussians.options import GaussianOptions
 from benchmarks.methods.gaussians.parameters import parameters_from_points
 from benchmarks.methods.gaussians.points import Points
@@ -40,7 +40,7 @@ class GaussianMethod(GaussianOptions, ABC):
         return Synthesis(
             images=trained.render(inputs.targets),
             seconds=watch.seconds,
-            given=trained.record,
+            given=trained.record | photographs_used(inputs.views),
             points=trained.seen_surface(),
             counts={"gaussians": float(len(trained.parameters.means))},
         )

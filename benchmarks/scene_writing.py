@@ -1,0 +1,151 @@
+"""Preparing a draw: its frames are read, their depth is found, and its folder is written."""
+
+import hashlib
+import os
+import shutil
+from collections.abc import Mapping
+from collections.abc import Sequence as ListOf
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.captures import Capture
+from benchmarks.files import json_bytes, npy_bytes, png_bytes
+from benchmarks.methods.base import Stopwatch
+from benchmarks.protocol import Draw
+from benchmarks.scenes import FORMAT, Scene
+from extrap_train.config import DatasetDepthConfig, DepthConfig, RulesConfig, StereoConfig
+from extrap_train.data.files import write_whole
+from extrap_train.data.module import with_warp
+from extrap_train.data.queries import query_batch
+from extrap_train.depth.build import depth_source
+from extrap_train.errors import InputError
+from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
+from extrap_train.views import Camera, View, stack_cameras
+
+DEPTHS: Mapping[str, DepthConfig] = {"dataset": DatasetDepthConfig(), "stereo": StereoConfig()}
+
+
+def prepare_scene(
+    folder: Path, capture: Capture, draw: Draw, rules: RulesConfig, origin: str
+) -> Scene:
+    """Read a draw's frames and write its folder, or open the one that is there.
+
+    `origin` names all that decides the content; a folder of another origin, with a changed file or
+    a damaged record, is made anew.
+    """
+    there = _whole_scene(folder, origin)
+    if there is not None:
+        return there
+    workshop = folder.with_name(f".{folder.name}.{os.getpid()}")
+    shutil.rmtree(workshop, ignore_errors=True)
+    try:
+        record = _write_scene(workshop, capture, draw, rules)
+        write_whole(workshop / "scene.json", json_bytes({**record, "origin": origin}))
+        shutil.rmtree(folder, ignore_errors=True)
+        workshop.replace(folder)
+    finally:
+        shutil.rmtree(workshop, ignore_errors=True)
+    return Scene.open(folder)
+
+
+def _whole_scene(folder: Path, origin: str) -> Scene | None:
+    """What is there already, if it is all there."""
+    if not (folder / "scene.json").is_file():
+        return None
+    try:
+        scene = Scene.open(folder)
+        same = scene.record["origin"] == origin and not scene.changed_files()
+    except (InputError, KeyError, TypeError, AttributeError):
+        return None
+    return scene if same else None
+
+
+def _write_scene(folder: Path, capture: Capture, draw: Draw, rules: RulesConfig) -> dict[str, Any]:
+    size = rules.image_size
+    frames = {frame.name: frame for frame in capture.sequence.frames}
+    missing = [name for name in (*draw.inputs, *draw.targets) if name not in frames]
+    if missing:
+        raise InputError(
+            f"{draw.category}/{draw.sequence}: has no frame {missing[0]}, which the protocol names"
+        )
+    photographs = [frames[name].load() for name in draw.inputs]
+    fine_size = size * _fine_scale(photographs, rules)
+    inputs, seconds = _with_depth(photographs, rules.depth, fine_size)
+    targets = [frames[name].load().squared(size) for name in draw.targets]
+    cameras = stack_cameras([view.camera for view in targets])
+    depths = [view.depth for view in inputs if view.depth is not None]
+    warp = with_warp(query_batch(inputs, cameras, len(inputs), fine_size)[0], size).warp
+    assert warp is not None
+    pictures = {
+        "inputs": torch.stack([view.image for view in inputs]),
+        "truth": torch.stack([view.image for view in targets]),
+        "warps": warp.image * warp.mask[:, None],
+        "masks": warp.mask[:, None].expand(-1, 3, -1, -1),
+    }
+    contents = {
+        f"{kind}/{i}.png": png_bytes(image)
+        for kind, images in pictures.items()
+        for i, image in enumerate(images)
+    }
+    contents["inputs/depth.npy"] = npy_bytes(torch.stack(depths))
+    known = [view.depth for view in targets if view.depth is not None]
+    if len(known) == len(targets):
+        contents["truth/depth.npy"] = npy_bytes(torch.stack(known))
+    if capture.surface is not None:
+        surface = capture.surface()
+        contents["truth/object.npy"] = npy_bytes(surface.object)
+        contents["truth/surroundings.npy"] = npy_bytes(surface.surroundings)
+    for name, content in contents.items():
+        write_whole(folder / name, content)
+    return {
+        "format": FORMAT,
+        "draw": asdict(draw),
+        "image_size": size,
+        "fine_size": fine_size,
+        "depth_seconds": seconds,
+        "cameras": {
+            "inputs": [_camera_record(view.camera.resized(size, size)) for view in inputs],
+            "targets": [_camera_record(view.camera) for view in targets],
+        },
+        "angles_rad": _angles_to_nearest([view.resized(size, size) for view in inputs], targets),
+        "files": {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()},
+    }
+
+
+def _fine_scale(photographs: ListOf[View], rules: RulesConfig) -> int:
+    """What the rules say, but nothing is scaled up."""
+    smallest = min(min(view.camera.height, view.camera.width) for view in photographs)
+    return max(1, min(rules.fine_scale, smallest // rules.image_size))
+
+
+def _with_depth(photographs: ListOf[View], depth_name: str, size: int) -> tuple[list[View], float]:
+    """The inputs at a size with their depth, and how long finding it took.
+
+    Depth is found at its source's own resolution, from the inputs alone.
+    """
+    source = depth_source(DEPTHS[depth_name])
+    side = max(size, source.image_size or 0)
+    large = [view.squared(side) for view in photographs]
+    with Stopwatch() as watch:
+        found = [depth.reliable() for depth in source.depth_maps(large)]
+    views = []
+    for view, depth in zip(large, found, strict=True):
+        posed = View(view.image, view.camera, depth, name=view.name)
+        views.append(posed.resized(size, size))
+    return views, 0.0 if depth_name == "dataset" else watch.seconds
+
+
+def _angles_to_nearest(inputs: ListOf[View], targets: ListOf[View]) -> list[float]:
+    cameras = stack_cameras([view.camera for view in (*inputs, *targets)])
+    angles = pairwise_angles(cameras, scene_center(cameras))
+    return [float(a) for a in angles[len(inputs) :, : len(inputs)].min(1)]
+
+
+def _camera_record(camera: Camera) -> dict[str, Any]:
+    return {
+        "world_to_cam": camera.world_to_cam.tolist(),
+        "intrinsics": camera.intrinsics.tolist(),
+    }
