@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks import cells
+from benchmarks import cells, making
 from benchmarks.catalogue import Catalogue
 from benchmarks.compare import compare
 from benchmarks.results import TIDY, read_results
@@ -131,13 +131,13 @@ def test_a_cell_of_the_cpu_sees_no_gpu_from_its_start(
     """Asking a GPU for its peak memory opens it, and hiding it afterwards changes nothing."""
     seen = []
 
-    class Watched(cells.PeakMemory):
+    class Watched(making.PeakMemory):
         def __enter__(self) -> "Watched":
             seen.append(os.environ.get("CUDA_VISIBLE_DEVICES"))
             super().__enter__()
             return self
 
-    monkeypatch.setattr(cells, "PeakMemory", Watched)
+    monkeypatch.setattr(making, "PeakMemory", Watched)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
     table = Catalogue.with_own([str(own)]).table("greys", [f"output={copy}", "device=cpu"])
     dark = Catalogue.with_own([str(own)]).method("dark")
