@@ -214,13 +214,8 @@ def _method_hashes(method: MethodConfig, category: str) -> dict[str, str]:
     except Unavailable as error:
         weights = f"missing: {error}"  # once they are there, the cell is another
     return {
-<<<<<<< HEAD
         "method": method_hash(method.factory, method.options),
-        "code": code_hash([inspect.getmodule(type(built)).__name__, "benchmarks.cells"]),  # type: ignore[union-attr]
-=======
-        "method": digest([method.factory, method.options]),
         "code": code_hash([inspect.getmodule(type(built)).__name__, "benchmarks.making"]),  # type: ignore[union-attr]
->>>>>>> 3f57cfd (What makes a cell's images stands apart from what scores them)
         "weights": weights,
     }
 
