@@ -185,6 +185,12 @@ def _compare(options: argparse.Namespace) -> int:
 
     table = compare(TableFolder(Path(options.before)), TableFolder(Path(options.after)))
     print(table.to_string(index=False, float_format=lambda value: f"{value:.4f}"))
+    if (table["scoring"] == "other").any():
+        print(
+            "note: where scoring is `other`, both were scored with other weights, options or code: "
+            "a change may be of the scoring, not of the method",
+            file=sys.stderr,
+        )
     return 0
 
 

@@ -2,73 +2,101 @@
 
 from typing import Any
 
+import numpy as np
 import pandas as pd
+from jaxtyping import Float
 
+from benchmarks.chance import FEWEST_CAPTURES, chance, is_beyond_chance, mean_interval
 from benchmarks.columns import direction
 from benchmarks.plan import TableFolder
-from benchmarks.results import UNIT, Results, by_capture, interval, read_results, seed_of
+from benchmarks.results import MEASURED, UNIT, Results, by_capture, read_results
 from extrap_train.errors import InputError
+
+_CELL = ["method", *UNIT, "n_views"]
+_HEADING = ["method", "draw", "n_views", "metric"]
 
 
 def compare(before: TableFolder, after: TableFolder) -> pd.DataFrame:
-    """A row a method, draw, number of views and metric: both means over the cells that both have,
-    the paired difference with its 95 % interval over captures, and a verdict.
+    """`compare_results` of two folders.
 
     Raises InputError where the two are of different protocols, or of different data.
     """
-    one, two = read_results(before), read_results(after)
+    return compare_results(read_results(before), read_results(after))
+
+
+def compare_results(one: Results, two: Results) -> pd.DataFrame:
+    """A row a method, draw, number of views and metric: both means over the cells that both have,
+    the paired difference with its 95 % interval over captures, the `chance` of it, a verdict, and
+    whether both were scored alike (`same`, or `other`: other weights of the networks, options or
+    code, so that a change may be the judges' and not the method's).
+
+    Raises InputError where the two are of different protocols, or of different data.
+    """
     if one.plan["protocol"] != two.plan["protocol"]:
         raise InputError(
-            f"{before.path} and {after.path} are of different protocols "
+            f"{one.folder.path} and {two.folder.path} are of different protocols "
             f"({one.plan['protocol'][:12]}, {two.plan['protocol'][:12]}): no number of one can be "
             "set against the other's"
         )
     _require_same_data(one, two)
-    keys = ["method", *UNIT, "n_views", "metric"]
-    both = one.tidy.merge(two.tidy, on=keys, suffixes=("_before", "_after"))
+    both = one.tidy.merge(two.tidy, on=[*_CELL, "metric"], suffixes=("_before", "_after"))
     both = both[both["metric"] != ""].dropna(subset=["value_before", "value_after"])
+    if both.empty:
+        raise InputError(f"{one.folder.path} and {two.folder.path} have no finished cell in common")
+    judges = _scorings(one), _scorings(two)
     rows = []
-    heading = ["method", "draw", "n_views", "metric"]
-    for head, part in both.groupby(heading, sort=False):
-        cells = part.set_index(UNIT)
-        means = by_capture(cells[["value_before", "value_after"]])
-        difference = (means["value_after"] - means["value_before"]).to_numpy()
-        low, high = interval(difference, seed_of(*map(str, head)))
-        rows.append(
-            {
-                **dict(zip(heading, head, strict=True)),
-                "before": means["value_before"].mean(),
-                "after": means["value_after"].mean(),
-                "difference": difference.mean(),
-                "low": low,
-                "high": high,
-                "captures": len(means),
-                "verdict": _verdict(low, high, direction(str(head[-1])), len(means)),
-            }
-        )
-    if not rows:
-        raise InputError(f"{before.path} and {after.path} have no finished cell in common")
+    for head, part in both.groupby(_HEADING, sort=False):
+        metric = str(head[-1])
+        row = {**dict(zip(_HEADING, head, strict=True)), **_change(part, direction(metric))}
+        cells = part[_CELL].itertuples(index=False, name=None)
+        alike = metric in MEASURED or all(judges[0][cell] == judges[1][cell] for cell in cells)
+        rows.append({**row, "scoring": "same" if alike else "other"})
     return pd.DataFrame(rows)
 
 
-def _require_same_data(before: Results, after: Results) -> None:
+def _change(part: pd.DataFrame, sign: int) -> dict[str, Any]:
+    means = by_capture(part.set_index(UNIT)[["value_before", "value_after"]])
+    difference = (means["value_after"] - means["value_before"]).to_numpy()
+    low, high = mean_interval(difference)
+    p = chance(difference)
+    return {
+        "before": means["value_before"].mean(),
+        "after": means["value_after"].mean(),
+        "difference": difference.mean(),
+        "low": low,
+        "high": high,
+        "captures": len(difference),
+        "p": p,
+        "verdict": _verdict(difference, p, sign),
+    }
+
+
+def _verdict(difference: Float[np.ndarray, " n"], p: float, sign: int) -> str:
+    if not difference.any():
+        return "the same"
+    if sign == 0:
+        return ""
+    if len(difference) < FEWEST_CAPTURES:
+        return "too few captures to tell"
+    if not is_beyond_chance(p):
+        return "no difference beyond chance"
+    return "better" if sign * difference.mean() > 0 else "worse"
+
+
+def _require_same_data(one: Results, two: Results) -> None:
     """A protocol names frames: what they show is another hash."""
-    known = {_task(cell): cell["hashes"]["data"] for cell in before.cells}
-    for cell in after.cells:
-        if known.get(_task(cell), cell["hashes"]["data"]) != cell["hashes"]["data"]:
+    known = {_draw(cell): cell["hashes"]["data"] for cell in one.cells}
+    for cell in two.cells:
+        if known.get(_draw(cell), cell["hashes"]["data"]) != cell["hashes"]["data"]:
             raise InputError(
-                f"{before.folder.path} and {after.folder.path} hold different photographs or "
+                f"{one.folder.path} and {two.folder.path} hold different photographs or "
                 f"cameras of {cell['scene']}: no number of one can be set against the other's"
             )
 
 
-def _task(cell: dict[str, Any]) -> tuple[Any, ...]:
+def _scorings(results: Results) -> dict[tuple[Any, ...], str]:
+    return {(cell["method"], *_draw(cell)): cell["hashes"]["scoring"] for cell in results.cells}
+
+
+def _draw(cell: dict[str, Any]) -> tuple[Any, ...]:
     return tuple(cell[name] for name in (*UNIT, "n_views"))
-
-
-def _verdict(low: float, high: float, sign: int, captures: int) -> str:
-    if low == high == 0:
-        return "the same"
-    if captures < 2 or low <= 0 <= high or sign == 0:
-        return "no difference beyond chance" if sign else ""
-    return "better" if (low > 0) == (sign > 0) else "worse"

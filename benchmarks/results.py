@@ -1,31 +1,34 @@
 """A table's results as data frames: every number, the means with intervals, paired differences."""
 
-import hashlib
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
 
 from benchmarks.cells import OK
+from benchmarks.chance import chance, is_beyond_chance, mean_interval
 from benchmarks.columns import direction
 from benchmarks.plan import TableFolder
 from benchmarks.records import planned_cells, read_plan
 from benchmarks.scenes import Scene
 from extrap_train.errors import InputError
 
-RESAMPLES = 2000
-CONFIDENCE = 0.95
 TIDY = [
     "method", "category", "sequence", "n_views", "draw", "seed", "metric", "value", "status",
     "reason",
 ]  # fmt: skip
+MEASURED = ("seconds", "peak_memory_mib")
+"""Metrics of the making of the images, not of the images: no scoring has to do with them."""
 UNIT = ["category", "sequence", "draw", "seed"]
 """What a paired comparison pairs by."""
 CAPTURE = ["category", "sequence"]
-"""What is drawn anew in a bootstrap: draws and seeds of one capture are no independent samples."""
+"""What counts as a sample: draws and seeds of one capture are no further ones."""
+MEANS = [
+    "method", "draw", "n_views", "metric", "mean", "low", "high", "captures", "cells", "of", "rank",
+    "p_best", "behind_best",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -54,8 +57,7 @@ class Results:
             for metric, score in cell["metrics"].items():
                 reason = {"reason": score["reason"]}
                 rows.append({**head, "metric": metric, "value": score["value"], **state, **reason})
-            measured = ("seconds", "peak_memory_mib")
-            rows += [{**head, "metric": name, "value": cell[name], **state} for name in measured]
+            rows += [{**head, "metric": name, "value": cell[name], **state} for name in MEASURED]
         table = pd.DataFrame(rows, columns=TIDY)
         return table.assign(value=table["value"].astype(float))
 
@@ -83,9 +85,12 @@ class Results:
         return pd.DataFrame(rows, columns=columns)
 
     def means(self, category: str | None = None) -> pd.DataFrame:
-        """A row a method, draw, number of views and metric: mean, interval over captures, the count
-        of cells and of those that any method has, rank, and whether the best is better beyond
-        chance (paired). A method that lacks cells has no rank: its mean is of other captures.
+        """A row a method, draw, number of views and metric: mean over captures with its interval,
+        the count of captures, of cells and of those that any method has, rank, the paired test
+        against the best (`p_best`), and whether the method is worse beyond chance.
+
+        A method that lacks cells has no rank: its mean is of other captures. Where most methods
+        lack some, none has: who is best would be a matter of who is left.
         """
         table = self.tidy[self.tidy["metric"] != ""].dropna(subset=["value"])
         if category is not None:
@@ -93,8 +98,7 @@ class Results:
         rows: list[dict[str, Any]] = []
         for (draw, n_views, metric), part in table.groupby(["draw", "n_views", "metric"]):
             rows += _ranked(part, {"draw": draw, "n_views": n_views, "metric": metric})
-        columns = ["method", "draw", "n_views", "metric", "mean", "low", "high", "cells", "of"]
-        return pd.DataFrame(rows, columns=[*columns, "rank", "behind_best"])
+        return pd.DataFrame(rows, columns=MEANS)
 
 
 def read_results(folder: TableFolder) -> Results:
@@ -113,19 +117,21 @@ def _ranked(part: pd.DataFrame, head: dict[str, Any]) -> list[dict[str, Any]]:
     """Means of one column, with ranks and paired differences to the best."""
     values = part.pivot_table(index=UNIT, columns="method", values="value", sort=False)
     sign = direction(head["metric"])
-    means = by_capture(values).mean()
     complete = values.notna().all()
-    ranks = (-sign * means[complete]).rank(method="min").reindex(means.index)
-    best = ranks.idxmin() if sign and complete.any() else None
+    means = by_capture(values).mean()
+    competing = means[complete] if sign and complete.mean() >= 0.5 else means[:0]
+    ranks = (-sign * competing).rank(method="min").reindex(means.index)
+    best = str(ranks.idxmin()) if len(competing) else None
     rows = []
-    for method in values.columns:
+    for method in map(str, values.columns):
         own = by_capture(values[method].dropna()).to_numpy()
-        low, high = interval(own, seed_of(str(method), *map(str, head.values())))
+        low, high = mean_interval(own)
         row = {"method": method, **head, "mean": own.mean(), "low": low, "high": high}
-        counts = {"cells": int(values[method].count()), "of": len(values)}
-        behind = method != best and best is not None and is_behind(values, str(best), str(method))
-        rank = ranks[method] if sign else np.nan
-        rows.append({**row, **counts, "rank": rank, "behind_best": behind})
+        row |= {"captures": len(own), "cells": int(values[method].count()), "of": len(values)}
+        row |= {"rank": ranks[method], "p_best": np.nan, "behind_best": False}
+        if best is not None and method != best:
+            row["p_best"], row["behind_best"] = to_best(values, best, method, sign)
+        rows.append(row)
     return rows
 
 
@@ -134,29 +140,11 @@ def by_capture(values: Any) -> Any:
     return values.groupby(level=CAPTURE, sort=False).mean()
 
 
-def is_behind(values: pd.DataFrame, best: str, other: str) -> bool:
-    """Whether the interval of the paired difference over captures leaves out zero, of the cells
-    that both have; the frame's index is `UNIT`.
-
-    A single capture tells nothing.
+def to_best(values: pd.DataFrame, best: str, method: str, sign: int) -> tuple[float, bool]:
+    """The chance of the paired differences between a method and the best, of the cells that both
+    have, and whether the method is worse beyond it; the frame's index is `UNIT`, and `sign` is
+    the metric's direction.
     """
-    both = values[[best, other]].dropna()
-    difference = by_capture(both[best] - both[other]).to_numpy()
-    if len(difference) < 2:
-        return False
-    low, high = interval(difference, seed_of(best, other))
-    return bool(low > 0 or high < 0)
-
-
-def interval(values: Float[np.ndarray, " n"], seed: int) -> tuple[float, float]:
-    """Percentile bootstrap of the mean at 95 %: the mean itself for a single value."""
-    rng = np.random.default_rng(seed)
-    drawn = rng.integers(len(values), size=(RESAMPLES, len(values)))
-    tail = (1 - CONFIDENCE) / 2
-    low, high = np.quantile(values[drawn].mean(1), [tail, 1 - tail])
-    return float(low), float(high)
-
-
-def seed_of(*names: str) -> int:
-    """The same for the same names, whatever else is in the table."""
-    return int.from_bytes(hashlib.sha256("/".join(names).encode()).digest()[:8], "big")
+    ahead = sign * by_capture((values[best] - values[method]).dropna()).to_numpy()
+    p = chance(ahead)
+    return p, is_beyond_chance(p) and bool(ahead.mean() > 0)

@@ -7,6 +7,7 @@ from typing import Any
 import pandas as pd
 
 from benchmarks.cells import OK
+from benchmarks.chance import FEWEST_CAPTURES
 from benchmarks.columns import direction
 from benchmarks.results import Results
 
@@ -45,7 +46,7 @@ class Entry:
     rank: int | None = None
     """1 is the best of its column, 2 the second."""
     ties_best: bool = False
-    """No difference to the best beyond chance (paired bootstrap, 95 %)."""
+    """No worse than the best beyond chance (`benchmarks.chance`)."""
     title: str = ""
     """Interval and count, or why there is no number."""
 
@@ -119,6 +120,7 @@ def _panel(
         if cell["draw"] == draw and category in (None, cell["category"])
     ]
     views = sorted({cell["n_views"] for cell in cells})
+    captures = len({(cell["category"], cell["sequence"]) for cell in cells})
     columns = [(metric, n) for metric in results.plan["table"]["columns"] for n in views]
     known = {(r.method, r.metric, r.n_views): r for r in means.itertuples()}
     rows = [
@@ -129,22 +131,33 @@ def _panel(
         )
         for method, entry in results.methods.items()
     ]
-    return Panel(title, columns, rows)
+    return Panel(f"{title} ({_counted_captures(captures)})", columns, rows)
+
+
+def _counted_captures(count: int) -> str:
+    many = f"{count} capture{'s' if count > 1 else ''}"
+    return many if count >= FEWEST_CAPTURES else f"{many}: too few to tell methods apart"
 
 
 def _entry(mean: Any, metric: str) -> Entry:
     if mean is None:
         return Entry("–", None, title="no number: see below")
     rank = None if pd.isna(mean.rank) else int(mean.rank)
-    low, high = (_number(v, metric) for v in (mean.low, mean.high))
     lacking = f" ({mean.cells}/{mean.of})" if mean.cells < mean.of else ""
     return Entry(
         text=_number(mean.mean, metric) + lacking,
         value=float(mean.mean),
         rank=rank,
         ties_best=rank is not None and rank > 1 and not mean.behind_best,
-        title=f"95 % interval {low} to {high}, {mean.cells} cells",
+        title=_spread(mean, metric),
     )
+
+
+def _spread(mean: Any, metric: str) -> str:
+    if mean.captures == 1:
+        return f"no interval: a single capture, {mean.cells} cells"
+    low, high = (_number(v, metric) for v in (mean.low, mean.high))
+    return f"95 % interval {low} to {high} over {mean.captures} captures, {mean.cells} cells"
 
 
 def _number(value: float, metric: str) -> str:
@@ -202,9 +215,10 @@ def _notes(results: Results) -> list[str]:
         f"Protocol {protocol[:16]}: {rules['pool']} frames by farthest-point sampling, "
         f"{rules['image_size']} × {rules['image_size']} px, depth of the inputs: {rules['depth']}. "
         f"Device: {', '.join(devices)}.",
-        "Best bold, second underlined; ° marks what cannot be told from the best (the 95 % "
-        "bootstrap interval of the paired differences over captures holds zero). A mean that lacks "
-        "cells says how many it has of how many, and is not ranked.",
+        "Best bold, second underlined; ° marks what cannot be told from the best (sign-flip test "
+        "of the paired differences over captures, p above 5 %; below "
+        f"{FEWEST_CAPTURES} captures nothing can). A mean that lacks cells says how many it has of "
+        "how many, and is not ranked.",
         "Time: " + "; ".join(f"{title}: {meaning}" for title, meaning in times.items()) + ".",
         *_given(results),
     ]

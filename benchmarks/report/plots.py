@@ -1,17 +1,20 @@
 """What a table does not show: quality over the angle to the nearest input, and against time."""
 
 import io
+from itertools import product
+from typing import Any
 
 import matplotlib.pyplot as plt
-import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from benchmarks.report.layout import name_of
-from benchmarks.results import Results
+from benchmarks.results import CAPTURE, Results
 
 _BIN_DEG = 20
+_ASIDE_DEG = 0.7
+"""Between two methods' points of one interval, so that no error bar hides another."""
 ANGLE_METRICS = ("masked_psnr", "psnr", "lpips_squeeze", "lpips_alex")
 
 
@@ -30,56 +33,93 @@ def plots(results: Results) -> dict[str, str]:
 
 
 def _over_angle(part: pd.DataFrame, metric: str, results: Results) -> str:
-    """A panel a draw: on well-spread inputs targets are near, on one-sided ones far."""
-    draws = list(dict.fromkeys(part["draw"]))
-    figure, row = plt.subplots(
-        1,
+    """A panel a draw and number of views, which angles go with: more inputs are nearer to all
+    targets, and so are well-spread ones.
+    """
+    draws, views = list(dict.fromkeys(part["draw"])), sorted(set(part["n_views"]))
+    figure, grid = plt.subplots(
+        len(views),
         len(draws),
-        figsize=(5 * len(draws) + 1.2, 3.6),
+        figsize=(5 * len(draws) + 1.2, 3 * len(views) + 0.6),
         squeeze=False,
+        sharex=True,
         sharey=True,
         layout="constrained",
     )
-    for axes, draw in zip(row[0], draws, strict=True):
-        chosen = part[part["draw"] == draw]
-        for method, entry in results.methods.items():
-            own = chosen[chosen["method"] == method]
-            if len(own):
-                _binned(axes, own, entry["title"] or method)
-        axes.set_title(f"{draw} inputs")
+    for (n_views, draw), axes in zip(product(views, draws), grid.flat, strict=True):
+        chosen = part[(part["draw"] == draw) & (part["n_views"] == n_views)]
+        for index, (method, entry) in enumerate(results.methods.items()):
+            own = binned(chosen[chosen["method"] == method])
+            aside = (index - (len(results.methods) - 1) / 2) * _ASIDE_DEG
+            _curve(axes, own, aside, f"C{index}", entry["title"] or method)
+        _captures_below(axes, chosen)
+        axes.set_title(f"{draw} inputs, {n_views} views", fontsize="medium")
+    for axes in grid[-1]:
         axes.set_xlabel("angle to the nearest input, degrees")
-    row[0][0].set_ylabel(name_of(metric))
-    _legend(figure, row[0][-1])
+    for axes in grid[:, 0]:
+        axes.set_ylabel(name_of(metric))
+    _legend(figure)
     return _svg(figure)
 
 
-def _binned(axes: Axes, own: pd.DataFrame, label: str) -> None:
-    center = (own["angle_deg"] // _BIN_DEG + 0.5) * _BIN_DEG
-    groups = own["value"].groupby(center)
-    mean = groups.mean()
-    error = groups.std().fillna(0.0).to_numpy() / np.sqrt(groups.count().to_numpy())
-    axes.errorbar(mean.index, mean, yerr=error, marker="o", markersize=4, label=label)
+def binned(images: pd.DataFrame) -> pd.DataFrame:
+    """A row an interval of angles, by its `center`: mean over captures, its standard error (NaN
+    for a single one) and the count of `captures`. Images of one capture are no further samples.
+    """
+    center = ((images["angle_deg"] // _BIN_DEG + 0.5) * _BIN_DEG).rename("center")
+    by_capture = images["value"].groupby([center, *(images[name] for name in CAPTURE)]).mean()
+    groups = by_capture.groupby(level="center")
+    return pd.DataFrame({"mean": groups.mean(), "error": groups.sem(), "captures": groups.count()})
+
+
+def _curve(axes: Axes, own: pd.DataFrame, aside: float, color: str, label: str) -> None:
+    """Hollow where a single capture is all there is."""
+    if own.empty:
+        return
+    at = own.index.to_numpy() + aside
+    axes.errorbar(at, own["mean"], yerr=own["error"], color=color, marker="o", ms=4, label=label)
+    single = (own["captures"] == 1).to_numpy()
+    axes.plot(at[single], own["mean"][single], "o", ms=4, mec=color, mfc="white", zorder=3)
+
+
+def _captures_below(axes: Axes, images: pd.DataFrame) -> None:
+    """How many captures have a target at such angles, along the lower edge."""
+    for center, row in binned(images).iterrows():
+        axes.text(
+            float(str(center)),
+            0.01,
+            f"{row['captures']:.0f}",
+            transform=axes.get_xaxis_transform(),
+            ha="center",
+            va="bottom",
+            color="gray",
+            fontsize="x-small",
+        )
 
 
 def _over_time(means: pd.DataFrame, metric: str, results: Results) -> str:
     """A point a method and number of views."""
     wide = means.pivot_table(index=["method", "draw", "n_views"], columns="metric", values="mean")
     figure, axes = plt.subplots(figsize=(6.2, 3.6), layout="constrained")
-    for method, entry in results.methods.items():
+    for index, (method, entry) in enumerate(results.methods.items()):
         own = wide[wide.index.get_level_values("method") == method]
         if len(own):
-            axes.plot(own["seconds"], own[metric], "o", label=entry["title"] or method)
+            label = entry["title"] or method
+            axes.plot(own["seconds"], own[metric], "o", color=f"C{index}", label=label)
     axes.set_xscale("log")
     axes.set_xlabel("perform time, seconds (in all, or per image: see the notes)")
     axes.set_ylabel(name_of(metric))
-    _legend(figure, axes)
+    _legend(figure)
     return _svg(figure)
 
 
-def _legend(figure: Figure, axes: Axes) -> None:
-    """Beside the panels, where it hides no point."""
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside right upper", fontsize="small")
+def _legend(figure: Figure) -> None:
+    """Beside the panels, where it hides no point; with what any of them shows."""
+    found: dict[str, Any] = {}
+    for axes in figure.axes:
+        handles, labels = axes.get_legend_handles_labels()
+        found |= dict(zip(labels, handles, strict=True))
+    figure.legend(found.values(), found.keys(), loc="outside right upper", fontsize="small")
 
 
 def _svg(figure: Figure) -> str:

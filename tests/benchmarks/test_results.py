@@ -1,28 +1,15 @@
 """Intervals, ranks and paired differences, against what is known of the numbers."""
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pandas as pd
 import pytest
 
+from benchmarks.chance import mean_interval
 from benchmarks.columns import COLUMNS, direction
-from benchmarks.plan import TableFolder
 from benchmarks.report.layout import NAMES, Entry, Layout, Panel, Row, lay_out
 from benchmarks.report.text import latex, markdown
-from benchmarks.results import UNIT, Results, interval, is_behind
-
-
-def test_the_interval_is_the_means_own_spread() -> None:
-    """Against the normal theory of a mean of 400."""
-    values = np.random.default_rng(0).normal(5.0, 2.0, 400)
-    low, high = interval(values, seed=1)
-    half = 1.96 * values.std() / 20
-    assert low == pytest.approx(values.mean() - half, abs=0.04)
-    assert high == pytest.approx(values.mean() + half, abs=0.04)
-    assert interval(values, seed=1) == (low, high)
-    assert interval(np.array([3.0]), seed=0) == (3.0, 3.0)
+from benchmarks.results import UNIT, to_best
+from tests.benchmarks.made import cell, results
 
 
 def test_pairing_sees_a_small_difference_among_large_ones() -> None:
@@ -32,87 +19,118 @@ def test_pairing_sees_a_small_difference_among_large_ones() -> None:
     captures = pd.MultiIndex.from_tuples([("cup", i, "random", 0) for i in range(24)], names=UNIT)
     noise = rng.normal(0, 0.02, 24)
     table = pd.DataFrame({"a": scenes, "b": scenes - 0.1 + noise}, index=captures)
-    assert interval(table["a"].to_numpy(), 0)[0] < interval(table["b"].to_numpy(), 0)[1]
-    assert is_behind(table, "a", "b")
-    assert not is_behind(table.assign(b=scenes + rng.normal(0, 1, 24)), "a", "b")
-    assert not is_behind(table[:1], "a", "b")
+    assert mean_interval(table["a"].to_numpy())[0] < mean_interval(table["b"].to_numpy())[1]
+    assert to_best(table, "a", "b", sign=1)[1]
+    assert not to_best(table.assign(b=scenes + rng.normal(0, 1, 24)), "a", "b", sign=1)[1]
+    assert to_best(table[:6], "a", "b", sign=1) == (2 / 2**6, True)
+    assert not to_best(table[:5], "a", "b", sign=1)[1]
+    assert not to_best(table[:1], "a", "b", sign=1)[1]
 
 
 def test_every_metric_has_its_direction() -> None:
     assert direction("lpips_vgg") == direction("dists") == direction("seconds") == -1
     assert direction("masked_psnr") == direction("tsed") == 1
     assert direction("coverage") == direction("warp_psnr_truth") == 0
+    assert direction("peak_memory_mib") == direction("accuracy_distance") == 0
     assert set(NAMES) - {"lpips"} <= COLUMNS
-
-
-def _cell(
-    method: str, sequence: str, seed: int, psnr: float | None, **given: str
-) -> dict[str, Any]:
-    failed = {"status": "failed", "reason": "no luck"}
-    done = {"status": "ok", "reason": "", "seconds": 1.0, "peak_memory_mib": 9.0, "given": given}
-    done["metrics"] = {"psnr": {"value": psnr, "reason": "", "per_image": [psnr]}}
-    head = {"method": method, "category": "cup", "sequence": sequence, "draw": "random"}
-    return {
-        **head,
-        "seed": seed,
-        "n_views": 3,
-        "device": "cpu",
-        **(failed if psnr is None else done),
-    }
-
-
-def _results(*cells: dict[str, Any]) -> Results:
-    names = dict.fromkeys(cell["method"] for cell in cells)
-    table = {"name": "t", "title": "", "columns": ["psnr"]}
-    plan = {
-        "table": {**table, "rules": {"pool": 9, "image_size": 64, "depth": "dataset"}},
-        "protocol": "0" * 64,
-        "quick": False,
-        "cells": ["key"] * len(cells),
-        "methods": {name: {"title": name, "group": "", "time": "in all"} for name in names},
-    }
-    return Results(TableFolder(Path("nowhere")), plan, list(cells))
 
 
 def test_seeds_of_one_capture_are_no_further_captures() -> None:
     """Thirty seeds of two captures, of which one is for `a` and one for `b`: nothing is certain."""
     cells = [
-        _cell(method, sequence, seed, value)
+        cell(method, sequence, seed, value)
         for seed in range(30)
         for method, values in {"a": (30.0, 20.0), "b": (20.0, 29.9)}.items()
         for sequence, value in zip("01", values, strict=True)
     ]
-    means = _results(*cells).means().query("metric == 'psnr'").set_index("method")
-    assert tuple(means.loc["a", ["low", "high"]]) == (20.0, 30.0)  # either capture, twice
+    means = results(*cells).means().query("metric == 'psnr'").set_index("method")
+    half = 12.706 * 5.0  # Student's t of one degree of freedom, and the standard error of 20 and 30
+    assert tuple(means.loc["a", ["low", "high"]]) == pytest.approx((25 - half, 25 + half), rel=1e-4)
     assert list(means["cells"]) == [60, 60]
-    one = _results(*(cell for cell in cells if cell["sequence"] == "0")).means()
+    assert list(means["captures"]) == [2, 2]
+    one = results(*(one for one in cells if one["sequence"] == "0")).means()
     assert not one["behind_best"].any(), "a single capture tells nothing, with any number of seeds"
+    assert one[["low", "high"]].isna().all(axis=None)
 
 
 def test_a_mean_over_easier_captures_is_not_the_best() -> None:
     """`partial` has failed on the capture that is hard for all."""
-    results = _results(
-        *(_cell("whole", sequence, 0, psnr) for sequence, psnr in {"0": 30.0, "1": 20.0}.items()),
-        *(_cell("worse", sequence, 0, psnr) for sequence, psnr in {"0": 29.0, "1": 19.0}.items()),
-        *(_cell("partial", sequence, 0, psnr) for sequence, psnr in {"0": 28.0, "1": None}.items()),
+    table = results(
+        *(cell("whole", sequence, 0, psnr) for sequence, psnr in {"0": 30.0, "1": 20.0}.items()),
+        *(cell("worse", sequence, 0, psnr) for sequence, psnr in {"0": 29.0, "1": 19.0}.items()),
+        *(cell("partial", sequence, 0, psnr) for sequence, psnr in {"0": 28.0, "1": None}.items()),
     )
-    means = results.means().query("metric == 'psnr'").set_index("method")
+    means = table.means().query("metric == 'psnr'").set_index("method")
     assert means.loc["whole", "rank"] == 1
     assert means.loc["worse", "rank"] == 2
     assert np.isnan(means.loc["partial", "rank"])
-    text = markdown(lay_out(results, None))
+    text = markdown(lay_out(table, None))
     assert "| whole | **25.00** |" in text
-    assert "| worse | <u>24.00</u> |" in text
+    assert "| worse | <u>24.00</u>° |" in text
     assert "| partial | 28.00 (1/2) |" in text
 
 
-def test_what_was_given_is_said_of_every_cell() -> None:
-    results = _results(
-        _cell("ours", "0", 0, 30.0, depth="used", ended="time"),
-        _cell("ours", "1", 0, 30.0, depth="used", ended="steps"),
-        _cell("ours", "2", 0, 30.0, depth="used", ended="steps"),
+def test_nobody_is_behind_for_being_better() -> None:
+    """`partial` lacks a capture and so competes for no rank, but wins on all that it has; `late`
+    lacks one, too, and loses.
+    """
+    table = results(
+        *(cell("whole", str(i), 0, 20.0 + i) for i in range(12)),
+        *(cell("other", str(i), 0, 19.0 + i % 7) for i in range(12)),
+        *(cell("partial", str(i), 0, 25.0 + i if i else None) for i in range(12)),
+        *(cell("late", str(i), 0, 15.0 + i if i else None) for i in range(12)),
     )
-    notes = "\n".join(lay_out(results, None).notes)
+    means = table.means().query("metric == 'psnr'").set_index("method")
+    assert means.loc["whole", "rank"] == 1
+    assert means.loc["partial", "p_best"] == means.loc["late", "p_best"] == 2 / 2**11
+    assert not means.loc["partial", "behind_best"]
+    assert means.loc["late", "behind_best"]
+
+
+def test_who_is_left_is_not_the_best() -> None:
+    """Most methods lack a capture: the few that do not are no winners."""
+    names = ("a", "b", "c")
+    table = results(
+        *(cell(name, str(i), 0, 20.0 if i else None) for name in names for i in range(8)),
+        *(cell("whole", str(i), 0, 10.0) for i in range(8)),
+    )
+    means = table.means().query("metric == 'psnr'")
+    assert means["rank"].isna().all()
+    assert means["p_best"].isna().all()
+    assert not means["behind_best"].any()
+    assert "| whole | 10.00 |" in markdown(lay_out(table, None))
+
+
+def test_memory_and_a_conditional_distance_rank_nobody() -> None:
+    table = results(
+        *(cell("a", str(i), 0, 30.0, {"accuracy_distance": 0.01}) for i in range(8)),
+        *(cell("b", str(i), 0, 20.0, {"accuracy_distance": 0.09}) for i in range(8)),
+    )
+    means = table.means().set_index(["metric", "method"])
+    unranked = means.loc[["accuracy_distance", "peak_memory_mib"]]
+    assert unranked["rank"].isna().all()
+    assert not unranked["behind_best"].any()
+    assert means.loc[("psnr", "b"), "behind_best"]
+
+
+def test_a_panel_says_over_how_many_captures() -> None:
+    few = lay_out(results(*(cell("a", str(i), 0, 30.0 + i) for i in range(4))), None).panels[0]
+    assert few.title == "t, random inputs (4 captures: too few to tell methods apart)"
+    enough = lay_out(results(*(cell("a", str(i), 0, 30.0 + i) for i in range(6))), None).panels[0]
+    assert enough.title == "t, random inputs (6 captures)"
+    spread = "over 6 captures, 6 cells"
+    assert enough.rows[0].entries[0].title == f"95 % interval 30.54 to 34.46 {spread}"
+    one = lay_out(results(cell("a", "0", 0, 30.0)), None).panels[0]
+    assert one.rows[0].entries[0].title == "no interval: a single capture, 1 cells"
+
+
+def test_what_was_given_is_said_of_everycell() -> None:
+    table = results(
+        cell("ours", "0", 0, 30.0, depth="used", ended="time"),
+        cell("ours", "1", 0, 30.0, depth="used", ended="steps"),
+        cell("ours", "2", 0, 30.0, depth="used", ended="steps"),
+    )
+    notes = "\n".join(lay_out(table, None).notes)
     assert "Given: ours — depth: used, ended: steps (2 cells) / time (1 cells)." in notes
 
 

@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 from benchmarks import cells, making
+from benchmarks.__main__ import main
 from benchmarks.catalogue import Catalogue
 from benchmarks.compare import compare
 from benchmarks.results import TIDY, read_results
@@ -199,18 +200,31 @@ def test_a_dry_run_makes_nothing_and_says_what_is_missing(
     assert not list(tmp_path.glob("greys/cells/*"))
 
 
-def test_compare_pairs_cells_and_tells_better_from_worse(
-    own: Path, finished: Path, copy: Path
-) -> None:
+def test_compare_pairs_cells(own: Path, finished: Path, copy: Path) -> None:
     same = compare(greys_folder(finished), greys_folder(copy))
     assert (same[same["metric"] == "psnr"]["verdict"] == "the same").all()
     run_greys(own, copy, "options.dark.level=0.45")
     changed = compare(greys_folder(finished), greys_folder(copy)).set_index(["method", "metric"])
     row = changed.loc[("dark", "psnr")]
-    assert row["verdict"] == "better"
-    assert row["low"] > 0
+    assert row["verdict"] == "too few captures to tell"
+    assert row["captures"] == 2
     assert row["difference"] == pytest.approx(row["after"] - row["before"])
     assert changed.loc[("light", "psnr")]["verdict"] == "the same"
+    assert (changed["scoring"] == "same").all()
+
+
+def test_compare_notes_another_scoring(
+    own: Path, finished: Path, copy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_greys(own, copy, "scoring.lpips=[squeeze]")
+    rows = compare(greys_folder(finished), greys_folder(copy)).set_index("metric")
+    assert set(rows.loc["psnr", "scoring"]) == {"other"}
+    assert set(rows.loc["seconds", "scoring"]) == {"same"}
+    capsys.readouterr()
+    assert main(["compare", str(finished / "greys"), str(copy / "greys")]) == 0
+    assert "note: where scoring is `other`" in capsys.readouterr().err
+    assert main(["compare", str(copy / "greys"), str(copy / "greys")]) == 0
+    assert not capsys.readouterr().err
 
 
 def test_compare_keeps_draws_apart_and_refuses_other_photographs(
