@@ -1,12 +1,14 @@
 """Hashes of what decides a result beside its options: code and weights.
 
-A method's code is its own file and every file of this project, or beside it, that it imports, so
-that a change of a report's style leaves every finished cell as it is.
+A method's code is its own file and every file that it imports of this project, or of the folder
+that its own import begins at (`--config-dir`), so that a change of a report's style leaves every
+finished cell as it is. What is installed is no file of one's own.
 """
 
 import ast
 import hashlib
 import importlib.util
+import sysconfig
 from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -14,16 +16,20 @@ from pathlib import Path
 from extrap_train.errors import InputError
 
 _OURS = ("benchmarks", "data_prep", "extrap_train")
+_INSTALLED = ("site-packages", "dist-packages")
 
 
 def code_hash(modules: Iterable[str]) -> str:
-    """SHA-256 over the sources of some modules and of all that they import of these packages."""
+    """SHA-256 over the sources of some modules and of all that they import of these packages, and
+    of what lies beside them.
+    """
     found: dict[str, Path] = {}
     waiting = list(modules)
-    packages = {*_OURS, *(name.partition(".")[0] for name in waiting)}
+    packages = {*_OURS, *map(_top, waiting)}
+    roots = [root for name in waiting if _top(name) not in _OURS for root in _import_roots(name)]
     while waiting:
         name = waiting.pop()
-        if name in found or name.partition(".")[0] not in packages:
+        if name in found or not (_top(name) in packages or _lies_in(_top(name), roots)):
             continue
         source = _source(name)
         if source is not None:
@@ -65,6 +71,47 @@ def _source(module: str) -> Path | None:
     if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
         return None
     return Path(spec.origin)
+
+
+def _top(module: str) -> str:
+    return module.partition(".")[0]
+
+
+def _import_roots(module: str) -> list[Path]:
+    """The folder on the import path that a module is found in, as in `root/package/module.py`."""
+    source = _source(module)
+    if source is None:
+        return []
+    depth = module.count(".") + (source.name == "__init__.py")
+    return [source.resolve().parents[depth]]
+
+
+def _lies_in(package: str, roots: Sequence[Path]) -> bool:
+    """Whether a top-level module or package is in or under one of the folders, not installed."""
+    return any(
+        place.is_relative_to(root) and not _is_installed(place)
+        for root in roots
+        for place in _places(package)
+    )
+
+
+def _is_installed(place: Path) -> bool:
+    library = Path(sysconfig.get_path("stdlib")).resolve()
+    return place.is_relative_to(library) or any(part in _INSTALLED for part in place.parts)
+
+
+@lru_cache(4096)
+def _places(package: str) -> tuple[Path, ...]:
+    """Where a top-level module, or a package with or without `__init__.py`, lies."""
+    try:
+        spec = importlib.util.find_spec(package)
+    except (ImportError, ValueError):
+        return ()
+    if spec is None:
+        return ()
+    folders = spec.submodule_search_locations
+    places = [spec.origin or ""] if folders is None else folders
+    return tuple(Path(place).resolve() for place in places if place)
 
 
 def _package(module: str, source: Path) -> str:

@@ -9,7 +9,7 @@ from benchmarks import fingerprint
 
 def _fresh_hash(module: str) -> str:
     """As another process finds it: within one, sources do not change."""
-    for cached in (fingerprint._source, fingerprint._imports):
+    for cached in (fingerprint._source, fingerprint._imports, fingerprint._places):
         cached.cache_clear()
     return fingerprint.code_hash([module])
 
@@ -51,3 +51,33 @@ def test_images_do_not_hang_on_how_they_are_scored(monkeypatch: pytest.MonkeyPat
     fingerprint.code_hash(["benchmarks.making"])
     assert "benchmarks.scenes" in asked
     assert not {"benchmarks.scoring", "benchmarks.consistency", "benchmarks.captures"} & {*asked}
+
+
+def test_a_file_beside_the_method_counts_and_an_installed_one_does_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As `--config-dir` gives it, with a virtual environment in the same folder."""
+    installed = tmp_path / ".venv" / "lib" / "site-packages"
+    files = {
+        "own_blur.py": "import json\nimport own_library\nfrom own_helper import paint\n",
+        "own_helper.py": "def paint():\n    from own_parts.deep import brush\n",
+        "own_parts/deep/brush.py": "WIDTH = 1\n",  # no __init__.py on the way
+        "own_rows/row.py": "import own_helper\n",
+        "own_unused.py": "WIDTH = 1\n",
+        ".venv/lib/site-packages/own_library.py": "WIDTH = 1\n",
+    }
+    for name, source in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(source)
+    monkeypatch.syspath_prepend(installed)
+    monkeypatch.syspath_prepend(tmp_path)
+    counted = {
+        "own_blur": {"own_blur.py", "own_helper.py", "own_parts/deep/brush.py"},
+        "own_rows.row": {"own_rows/row.py", "own_helper.py", "own_parts/deep/brush.py"},
+    }
+    for method, expected in counted.items():
+        before = _fresh_hash(method)
+        for name, source in files.items():
+            (tmp_path / name).write_text(source + "# changed\n")
+            assert (_fresh_hash(method) != before) == (name in expected), (method, name)
+            (tmp_path / name).write_text(source)
