@@ -240,3 +240,14 @@ def test_set_lists_of_the_wrong_shape(root, content):
     file = root / "cup" / "set_lists" / "set_lists_manyview_dev_0.json"
     file.write_text(json.dumps(content))
     assert file.name in complaint(read_set_list, root, "cup", "manyview_dev_0")
+
+
+@pytest.mark.parametrize("letter", [0xD800, 0xDCFF])
+@pytest.mark.parametrize("file", ["frame_annotations.jgz", "sequence_annotations.jgz"])
+def test_a_name_that_is_no_unicode(root, file, letter):
+    path = root / "cup" / file
+    entries = json.loads(gzip.decompress(path.read_bytes()))
+    entries[0]["sequence_name"] = f"s5{chr(letter)}"
+    path.write_bytes(gzip.compress(json.dumps(entries).encode()))
+    message = complaint(read_category, root, "cup")
+    assert f"{file}: entry 0 is malformed (sequence_name 's5\\u{letter:x}' is no" in message
