@@ -81,7 +81,10 @@ def _weight_files(tool: object) -> list[Path]:
         case Mast3rConfig() | LoftrMatcherConfig() | AlikedMatcherConfig():
             return [Path(tool.checkpoint or "")]
         case MonocularConfig():
-            return [*sorted(Path(tool.model).glob("*")), *_weight_files(tool.matcher)]
+            # transformers takes seconds to load: only where it is wanted.
+            from extrap_train.depth.depth_anything import files_read
+
+            return [*files_read(tool.model), *_weight_files(tool.matcher)]
         case _:
             return []
 

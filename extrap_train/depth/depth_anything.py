@@ -11,12 +11,17 @@ from safetensors import SafetensorError
 from torch import Tensor
 from torch.nn import functional
 from transformers import AutoConfig, AutoImageProcessor, DepthAnythingForDepthEstimation
+from transformers.utils import cached_file
 
 from extrap_train.device import fastest_device
 from extrap_train.errors import InputError
 
 _UNUSABLE = (OSError, ValueError, KeyError, TypeError, RuntimeError, SafetensorError)
 """What transformers raises on folders that hold nothing of its own, or something else."""
+
+_HARMLESS: dict[str, Any] = {"local_files_only": True, "trust_remote_code": False}
+"""Nothing is downloaded, and code in the folder is neither run nor asked for."""
+_READ = ("config.json", "preprocessor_config.json", "*.safetensors")
 
 
 @dataclass(frozen=True)
@@ -50,13 +55,13 @@ def read_depth_anything(model: str, device: torch.device | None = None) -> Depth
     is one. InputError where it is absent or another model.
     """
     try:
-        kind = AutoConfig.from_pretrained(model, local_files_only=True).model_type
+        kind = AutoConfig.from_pretrained(model, **_HARMLESS).model_type
         if kind != "depth_anything":
             raise _refusal(model, f"is a model of kind {kind}")
         loaded: Any = DepthAnythingForDepthEstimation.from_pretrained(
-            model, local_files_only=True, use_safetensors=True, output_loading_info=True
+            model, **_HARMLESS, use_safetensors=True, output_loading_info=True
         )
-        processor = AutoImageProcessor.from_pretrained(model, local_files_only=True)
+        processor = AutoImageProcessor.from_pretrained(model, **_HARMLESS)
     except InputError:
         raise
     except _UNUSABLE as error:
@@ -69,8 +74,25 @@ def read_depth_anything(model: str, device: torch.device | None = None) -> Depth
         if said.get(problem):
             names = sorted(map(str, said[problem]))
             raise _refusal(model, f"has {len(names)} {problem.replace('_', ' ')} ({names[0]})")
+    try:
+        side = int(processor.size["height"])
+    except (AttributeError, KeyError, TypeError):  # of the shorter side, or no picture at all
+        raise _refusal(model, "has no size.height in its preprocessor_config.json") from None
     network = network.eval().requires_grad_(False).to(device or fastest_device())
-    return DepthAnything(network, processor, int(processor.size["height"]))
+    return DepthAnything(network, processor, side)
+
+
+def files_read(model: str) -> list[Path]:
+    """What `read_depth_anything` reads, to tell other weights; nothing where there is no model.
+
+    A name in the cache of downloads stands for the revision that its main branch points to.
+    """
+    try:
+        config = cached_file(model, "config.json", local_files_only=True)
+    except OSError:
+        return []
+    folder = Path(config).parent
+    return sorted(file for pattern in _READ for file in folder.glob(pattern))
 
 
 def _refusal(model: str, reason: str) -> InputError:

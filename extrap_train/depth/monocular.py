@@ -138,8 +138,14 @@ class MonocularDepth:
                 "wrong, or depth.model is unfit: try another depth.matcher or depth=stereo"
             )
         explained = (line(at_points) * points.depth - 1).abs() <= EXPLAINED
+        if not explained.any():
+            raise NotAligned(
+                f"{name}: the network's depth agrees with none of the {count} points that are "
+                "found in other views; try another depth.matcher or depth=stereo"
+            )
         inverse = line(predicted)
-        near_enough = inverse > 1 / (FARTHEST * points.depth.max())
+        # Not of all points: a single wrong match may lie anywhere.
+        near_enough = inverse > 1 / (FARTHEST * points.depth[explained].max())
         confidence = explained.float().mean() * near_enough
         return DepthMap(torch.where(near_enough, 1 / inverse, 0), confidence)
 

@@ -3,9 +3,11 @@
 import json
 import os
 import re
+import shutil
 
 import pytest
 import torch
+from huggingface_hub import constants
 from transformers import (
     DepthAnythingConfig,
     DepthAnythingForDepthEstimation,
@@ -13,9 +15,10 @@ from transformers import (
     DPTImageProcessor,
 )
 
+from data_prep.tools import Tools
 from extrap_train.config import FlowMatcherConfig, MonocularConfig
 from extrap_train.depth.build import depth_source
-from extrap_train.depth.depth_anything import read_depth_anything
+from extrap_train.depth.depth_anything import files_read, read_depth_anything
 from extrap_train.depth.monocular import MonocularDepth
 from extrap_train.errors import InputError
 
@@ -110,3 +113,49 @@ def test_truncated_or_incomplete_weights(folder):
     weights.unlink()
     torch.save({}, folder / "pytorch_model.bin")  # pickles are not read
     refused(folder, "cannot be read")
+
+
+def test_code_in_the_folder_is_refused_without_a_question(folder, tmp_path, monkeypatch):
+    ran = tmp_path / "ran"
+    (folder / "evil.py").write_text(f"open({str(ran)!r}, 'w')\nclass Config: pass\n")
+    classes = {"AutoConfig": "evil.Config", "AutoImageProcessor": "evil.Config"}
+    monkeypatch.setattr("builtins.input", lambda *_: "y")
+    for name, kind in (("config.json", "evil"), ("preprocessor_config.json", "DPTImageProcessor")):
+        whole = (folder / name).read_text()
+        more = {"model_type": kind, "image_processor_type": "Evil", "auto_map": classes}
+        (folder / name).write_text(json.dumps(json.loads(whole) | more))
+        refused(folder, "contains custom code")
+        (folder / name).write_text(whole)
+    assert not ran.exists()
+
+
+def test_a_size_of_the_shorter_side_alone(folder):
+    path = folder / "preprocessor_config.json"
+    content = json.loads(path.read_text()) | {"size": {"shortest_edge": 56}}
+    path.write_text(json.dumps(content))
+    refused(folder, "has no size.height in its preprocessor_config.json")
+
+
+def test_only_what_is_read_tells_weights_apart(folder):
+    (folder / "README.md").write_text("a model")
+    (folder / ".git").mkdir()
+    names = [file.name for file in files_read(str(folder))]
+    assert names == ["config.json", "model.safetensors", "preprocessor_config.json"]
+    assert files_read(str(folder / "nowhere")) == []
+    assert files_read("nobody/no-such-model") == []
+
+
+def test_a_new_revision_of_a_downloaded_model_is_other_weights(folder, tmp_path, monkeypatch):
+    cache = tmp_path / "hub"
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(cache))
+    model = cache / "models--somebody--some-model"
+    (model / "refs").mkdir(parents=True)
+    options, found = MonocularConfig(model="somebody/some-model", matcher=FlowMatcherConfig()), []
+    for revision in ("a" * 40, "b" * 40):
+        (model / "refs" / "main").write_text(revision)
+        (model / "snapshots" / revision).mkdir(parents=True)
+        for file in files_read(str(folder)):
+            shutil.copy(file, model / "snapshots" / revision)
+        found.append(Tools(options, None).depth_identity)
+        assert {file.parent.name for file in files_read(options.model)} == {revision}
+    assert found[0] != found[1]

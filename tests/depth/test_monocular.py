@@ -1,5 +1,5 @@
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
@@ -9,7 +9,13 @@ from extrap_train.config import FlowMatcherConfig, MonocularConfig
 from extrap_train.depth import DepthSource
 from extrap_train.depth.monocular import MonocularDepth
 from extrap_train.errors import InputError
-from extrap_train.geometry.cameras import transform, unproject_to_world
+from extrap_train.geometry.cameras import (
+    pixel_grid,
+    project,
+    transform,
+    unproject_to_world,
+)
+from extrap_train.matching import Matches
 from extrap_train.matching.build import matcher
 
 SCENE = SCENES["box on the ground"]
@@ -84,3 +90,39 @@ def test_too_few_points_are_said_or_unknown():
     ):
         source.depth_map(views[0], views[1:])
     assert not any(found.depth.any() for found in source.depth_maps(views))
+
+
+@dataclass(frozen=True)
+class OneWrong:
+    """A matcher that takes the middle of the first view for something far away."""
+
+    views: list
+    far: float
+
+    def match(self, first: torch.Tensor, second: torch.Tensor) -> Matches:
+        found = matcher(FlowMatcherConfig()).match(first, second)
+        camera = self.views[0].camera
+        middle = pixel_grid(96, 96)[48:49, 48]
+        ray = torch.cat([middle, torch.ones(1, 1)], -1) @ camera.intrinsics.inverse().mT
+        point = transform(camera.cam_to_world, ray * self.far)
+        seen, _ = project(point, self.views[1].camera)
+        return Matches(
+            torch.cat([middle, found.first]),
+            torch.cat([seen, found.second]),
+            torch.cat([torch.ones(1), found.confidence]),
+        )
+
+
+def test_one_wrong_match_does_not_let_the_line_speak_of_what_is_far_away():
+    source, views = source_and_views(0, 8)
+    depth = views[0].depth.clone()
+    depth[:20, :20] = 20.0  # so the network says; no match is there
+    views[0] = replace(views[0], depth=depth)
+    wrong = OneWrong(views, 9.0)
+    source = MonocularDepth(MonocularConfig(), Oracle(views), wrong)
+    depths = source._points(*views).depth.sort().values
+    assert depths[-1] > 8.9
+    assert depths[-2] < 20 / 3, "one of them is wrong"
+    found = source.depth_map(views[0], views[1:])
+    assert not found.depth[:20, :20].any()
+    assert found.depth[40:56, 40:56].all()
