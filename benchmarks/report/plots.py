@@ -84,11 +84,12 @@ def _curve(axes: Axes, own: pd.DataFrame, aside: float, color: str, label: str) 
 
 def _captures_below(axes: Axes, images: pd.DataFrame) -> None:
     """How many captures have a target at such angles, along the lower edge."""
-    for center, row in binned(images).iterrows():
+    captures = binned(images)["captures"]
+    for center, count in zip(captures.index.to_numpy(), captures, strict=True):
         axes.text(
-            float(str(center)),
+            center,
             0.01,
-            f"{row['captures']:.0f}",
+            str(count),
             transform=axes.get_xaxis_transform(),
             ha="center",
             va="bottom",
