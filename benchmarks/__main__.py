@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from benchmarks.catalogue import Catalogue
-from benchmarks.table_checks import check_table, lpips_weights_of
+from benchmarks.table_checks import check_table, lpips_weights_of, require_output_alone
 from extrap_train.config import CATEGORIES
 from extrap_train.errors import InputError
 
@@ -148,6 +148,7 @@ def _run(options: argparse.Namespace) -> int:
 
 def _report(options: argparse.Namespace) -> int:
     catalogue = Catalogue.with_own(options.config_dir)
+    require_output_alone(options.overrides)
     table = catalogue.table(options.table, options.overrides)
     from benchmarks.plan import TableFolder
     from benchmarks.report import write_reports

@@ -4,7 +4,6 @@ import inspect
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -12,6 +11,7 @@ from benchmarks.backbones import judging_files
 from benchmarks.captures import Capture, freeze, open_captures
 from benchmarks.cells import CellJob
 from benchmarks.fingerprint import code_hash, weights_hash
+from benchmarks.method_checks import method_hash, require_different, require_options_fit
 from benchmarks.methods.base import Unavailable
 from benchmarks.methods.build import build_method
 from benchmarks.protocol import Draw, Protocol, digest
@@ -102,9 +102,10 @@ def open_protocol(table: TableConfig, folder: TableFolder) -> tuple[Protocol, li
     """The table's frozen protocol, made now if there is none yet, and its captures.
 
     One without any result is made anew. Raises InputError where the folder holds results of another
-    protocol.
+    protocol, and for two captures of one name.
     """
     captures = open_captures(table.captures, table.captures.categories)
+    _require_own_names(captures)
     fresh = freeze(table.captures, table.rules, captures)
     if not folder.protocol.is_file() or not any(folder.cells.glob("*/cell.json")):
         fresh.write(folder.protocol)
@@ -116,6 +117,16 @@ def open_protocol(table: TableConfig, folder: TableFolder) -> tuple[Protocol, li
             f"{fresh.sha256[:12]}: {_difference(frozen, fresh)}); choose another output="
         )
     return frozen, captures
+
+
+def _require_own_names(captures: Iterable[Capture]) -> None:
+    """A draw knows its capture by name."""
+    known = set()
+    for capture in captures:
+        name = f"{capture.sequence.category}/{capture.sequence.name}"
+        if name in known:
+            raise InputError(f"two captures are called {name}; rename one's folder")
+        known.add(name)
 
 
 def _difference(frozen: Protocol, fresh: Protocol) -> str:
@@ -145,9 +156,11 @@ def cell_jobs(
 ) -> list[CellJob]:
     """A job a method and draw, scene by scene, each named by all that decides its result.
 
-    Raises InputError for two methods that are the same: one cell cannot be two rows.
+    Raises InputError for two methods that are the same, and for options of a wrong kind.
     """
-    _require_different(methods)
+    require_different(methods)
+    for method in methods:
+        require_options_fit(method)
     device = _device(table.device)
     scoring = digest(
         [
@@ -191,22 +204,6 @@ def cell_key(hashes: Mapping[str, str]) -> str:
     return digest([hashes["images"], hashes["scoring"]])[:KEY_LENGTH]
 
 
-def method_hash(factory: str, options: Mapping[str, Any]) -> str:
-    """Of what a method's YAML and the table's options say."""
-    return digest([factory, dict(options)])
-
-
-def _require_different(methods: list[MethodConfig]) -> None:
-    known: dict[str, str] = {}
-    for method in methods:
-        same = known.setdefault(method_hash(method.factory, method.options), method.name)
-        if same != method.name:
-            raise InputError(
-                f"methods {same} and {method.name} are the same, with the same options; leave one "
-                "out: methods=[...]"
-            )
-
-
 def _method_hashes(method: MethodConfig, category: str) -> dict[str, str]:
     built = build_method(method)
     try:
@@ -214,7 +211,7 @@ def _method_hashes(method: MethodConfig, category: str) -> dict[str, str]:
     except Unavailable as error:
         weights = f"missing: {error}"  # once they are there, the cell is another
     return {
-        "method": method_hash(method.factory, method.options),
+        "method": method_hash(method),
         "code": code_hash([inspect.getmodule(type(built)).__name__, "benchmarks.making"]),  # type: ignore[union-attr]
         "weights": weights,
     }

@@ -1,6 +1,7 @@
 """Whether what a table says can be meant, before anything heavy loads (no torch)."""
 
 from collections.abc import Collection, Iterable
+from typing import Any
 
 from benchmarks.catalogue import Catalogue
 from benchmarks.columns import COLUMNS
@@ -15,6 +16,8 @@ from extrap_train.config import (
 from extrap_train.errors import InputError, did_you_mean
 
 DEPTHS = ("dataset", "stereo")
+SSIM_WINDOW = 11
+"""Pixels a side, which no image can be smaller than."""
 
 
 def check_table(table: TableConfig, catalogue: Catalogue) -> None:
@@ -28,10 +31,18 @@ def check_table(table: TableConfig, catalogue: Catalogue) -> None:
     _require_known("scoring.lpips_weights", table.scoring.lpips_weights, LPIPS_NETS)
     _require_known("columns", table.columns, COLUMNS)
     _require_known("options", table.options, catalogue.names("method"))
+    _require_known("reported", filter(None, [table.reported]), catalogue.names("reported"))
     for name in table.methods:
         catalogue.method(name)
+    _require_once(table)
+    _require_bounds(table)
     _require_held_out(table.captures)
-    given = table.captures.source == "reconfusion"  # its files name the targets
+    given = table.captures.source == "reconfusion"  # its files name inputs and targets
+    if rules.draws != ["given"] if given else "given" in rules.draws:
+        raise InputError(
+            f"rules.draws={rules.draws}: captures.source=reconfusion has draws of its own, "
+            "rules.draws=[given], and nothing else has"
+        )
     for n_views in rules.views:
         if n_views < 1 or (n_views >= rules.pool and not given):
             raise InputError(
@@ -55,6 +66,49 @@ def lpips_weights_of(overrides: Iterable[str]) -> dict[str, str]:
     return weights
 
 
+def require_output_alone(overrides: Iterable[str]) -> None:
+    """InputError for an option that reports cannot follow: they show a table as it was run."""
+    for word in overrides:
+        if word.partition("=")[0] != "output":
+            raise InputError(f"{word}: a report takes output=FOLDER alone; run the table with it")
+
+
+def _require_once(table: TableConfig) -> None:
+    """No row, capture or draw is measured twice, or counts twice in a mean."""
+    lists: dict[str, list[Any]] = {
+        "methods": table.methods,
+        "draws": table.draws,
+        "columns": table.columns,
+        "rules.views": table.rules.views,
+        "rules.draws": table.rules.draws,
+        "rules.seeds": table.rules.seeds,
+        "captures.categories": table.captures.categories,
+        "captures.scenes": table.captures.scenes,
+        "quick.categories": table.quick.categories,
+        "scoring.lpips": table.scoring.lpips,
+    }
+    for option, words in lists.items():
+        twice = [word for index, word in enumerate(words) if word in words[:index]]
+        if twice:
+            raise InputError(f"{option}: {twice[0]} is there twice; leave one out")
+
+
+def _require_bounds(table: TableConfig) -> None:
+    least = {
+        "rules.image_size": (table.rules.image_size, SSIM_WINDOW),
+        "rules.fine_scale": (table.rules.fine_scale, 1),
+        "rules.pool": (table.rules.pool, 2),
+        "captures.sequences": (table.captures.sequences, 1),
+        "captures.frames": (table.captures.frames, 1),
+        "captures.render_size": (table.captures.render_size, 1),
+        "quick.sequences": (table.quick.sequences, 1),
+        "rules.seeds": (min(table.rules.seeds, default=0), 0),
+    }
+    for option, (value, bound) in least.items():
+        if value < bound:
+            raise InputError(f"{option}={value}: must be at least {bound}")
+
+
 def _require_held_out(captures: CapturesConfig) -> None:
     """Behind the rendered captures for testing follow those that models are trained on."""
     usual = SyntheticConfig()
@@ -64,6 +118,15 @@ def _require_held_out(captures: CapturesConfig) -> None:
             f"captures.sequences={captures.sequences}: models are trained on the rendered captures "
             f"behind the first {usual.test_sequences}; give fewer, or another captures.seed="
         )
+    for spec in captures.scenes if captures.source == "scenes" else ():
+        scheme, _, name = spec.partition(":")
+        number = name.rpartition("/")[2]
+        is_number = scheme == "synthetic" and number.isascii() and number.isdigit()
+        if is_number and int(number) >= usual.test_sequences:
+            raise InputError(
+                f"captures.scenes: models are trained on {spec}; give one of the first "
+                f"{usual.test_sequences}"
+            )
 
 
 def _require_known(option: str, words: Iterable[str], known: Collection[str]) -> None:

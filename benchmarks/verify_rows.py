@@ -7,11 +7,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from benchmarks.plan import cell_key, images_hash, method_hash, selected_draws
+from benchmarks.method_checks import method_hash
+from benchmarks.plan import cell_key, images_hash, selected_draws
 from benchmarks.protocol import Draw, Protocol, digest
 from benchmarks.records import table_of
 from benchmarks.results import UNIT, Results
 from benchmarks.scenes import Scene
+from extrap_train.config import MethodConfig
 from extrap_train.errors import InputError
 
 
@@ -64,7 +66,9 @@ def cell_problems(results: Results, cell: dict[str, Any], scene: Scene) -> Itera
     hashes, row = cell["hashes"], results.methods[cell["method"]]
     if images_hash(hashes) != hashes["images"] or cell_key(hashes) != cell["key"]:
         yield "its name does not follow from the hashes that it states"
-    if hashes["method"] != method_hash(row["factory"], row["options"]):
+    if hashes["method"] != method_hash(
+        MethodConfig(factory=row["factory"], options=row["options"])
+    ):
         yield f"was not made by {row['factory']} with the options of its row"
     if cell["options"] != row["options"]:
         yield f"states the options {cell['options']}, its row has {row['options']}"

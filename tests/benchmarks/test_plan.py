@@ -3,10 +3,15 @@
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from benchmarks.captures import Capture
-from benchmarks.plan import TableFolder, prepare_draws
-from benchmarks.protocol import Draw, draw_sequence
-from extrap_train.config import RulesConfig, TableConfig
+from benchmarks.catalogue import Catalogue
+from benchmarks.method_checks import require_options_fit
+from benchmarks.plan import TableFolder, open_protocol, prepare_draws, selected_draws
+from benchmarks.protocol import Draw, Protocol, draw_sequence
+from extrap_train.config import CapturesConfig, QuickConfig, RulesConfig, TableConfig
+from extrap_train.errors import InputError
 from extrap_train.views import stack_poses
 from tests.benchmarks.analytic import analytic_capture
 
@@ -41,3 +46,55 @@ def test_a_harmless_name_is_its_folder(tmp_path: Path) -> None:
     draw = replace(_draw(Capture(analytic_capture(9, 24))), sequence="110_13051_23361")
     folder = TableFolder(tmp_path)
     assert folder.scene(draw) == tmp_path / "scenes" / "apple-110_13051_23361-3-random-0"
+
+
+def test_two_captures_of_one_name_are_refused(tmp_path: Path) -> None:
+    """Two folders called garden would be one capture, measured twice."""
+    specs = ["synthetic:apple/0000", "synthetic:apple/00000"]
+    captures = CapturesConfig(source="scenes", scenes=specs)
+    with pytest.raises(InputError, match="two captures are called apple/0000; rename"):
+        open_protocol(replace(_TABLE, captures=captures), TableFolder(tmp_path))
+
+
+def test_a_quick_part_without_captures_is_named() -> None:
+    protocol = Protocol(_TABLE.rules, (_draw(Capture(analytic_capture(9, 24))),))
+    table = replace(_TABLE, quick=QuickConfig(categories=["hydrant"]))
+    assert selected_draws(table, protocol, quick=False) == list(protocol.draws)
+    with pytest.raises(InputError, match=r"quick.categories=\['hydrant'\].*give.*\['apple'\]"):
+        selected_draws(table, protocol, quick=True)
+    with pytest.raises(InputError, match=r"no draw of \['spread'\]"):
+        selected_draws(replace(table, draws=["spread"]), protocol, quick=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "option", "value", "fits"),
+    [
+        ("3dgs", "iterations", "abc", False),
+        ("3dgs", "iterations", 3.5, False),
+        ("3dgs", "iterations", True, False),
+        ("3dgs", "iterations", 3, True),
+        ("ours", "steps", "abc", False),
+        ("ours", "guidance", 2, True),
+        ("ours", "guidance", "2", False),
+        ("ours", "weights", None, True),
+        ("ours", "weights", 3, False),
+        ("fsgs", "pairing", "nonsense", False),
+        ("dngaussian", "patch_range", [3, 5], True),
+    ],
+)
+def test_an_options_kind_is_what_the_method_declares(
+    name: str, option: str, value: object, fits: bool
+) -> None:
+    method = Catalogue.with_own().method(name)
+    method.options[option] = value
+    if fits:
+        require_options_fit(method)
+        return
+    with pytest.raises(InputError, match=f"options.{name}.{option}={value}: must be of type"):
+        require_options_fit(method)
+
+
+def test_what_every_method_of_the_package_is_given_fits() -> None:
+    catalogue = Catalogue.with_own()
+    for name in catalogue.names("method"):
+        require_options_fit(catalogue.method(name))
