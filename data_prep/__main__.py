@@ -1,6 +1,5 @@
 """`python -m data_prep`: sequences in, pair data set and report out."""
 
-import os
 from pathlib import Path
 
 from extrap_train.cli import command
@@ -21,7 +20,7 @@ def _run(config: DataPrepConfig) -> None:
             config.depth,
             config.prep,
             output=Path(config.output),
-            workers=config.workers or len(os.sched_getaffinity(0)),
+            workers=config.workers,
             matcher=config.matcher,
             launcher=config.launcher,
             retry=True,

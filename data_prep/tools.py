@@ -4,6 +4,7 @@ A network that is sent to another process takes a file descriptor a tensor along
 waits keeps them: a few jobs of MASt3R's nine hundred tensors are more than a process may have open.
 """
 
+import os
 import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ from extrap_train.config import (
 from extrap_train.data.files import file_stamp
 from extrap_train.depth import DepthSource
 from extrap_train.depth.build import depth_source
+from extrap_train.device import fastest_device
 from extrap_train.matching import Matcher
 from extrap_train.matching.build import matcher
 
@@ -62,6 +64,15 @@ class Tools:
         """On the GPU of this process, where it has one."""
         how = self.correction
         return _made(matcher, how) if isinstance(how, MatcherConfig) else how
+
+    def default_workers(self) -> int:
+        """One where a network runs on a GPU, whose memory every process would fill with another;
+        else one a core."""
+        networks = (Mast3rConfig, MonocularConfig, LoftrMatcherConfig, AlikedMatcherConfig)
+        on_gpu = fastest_device().type == "cuda"
+        if on_gpu and any(isinstance(tool, networks) for tool in (self.depth, self.correction)):
+            return 1
+        return len(os.sched_getaffinity(0))
 
     def check(self) -> None:
         """Raises InputError where weights cannot be used, without taking a GPU's memory."""

@@ -24,6 +24,7 @@ from extrap_train.data.frame_files import (
     write_frames,
 )
 from extrap_train.data.sequences import Sequence
+from extrap_train.device import is_out_of_memory
 from extrap_train.errors import InputError
 
 LOG = logging.getLogger(__name__)
@@ -101,7 +102,8 @@ def prepare_unit(unit: Unit) -> str:
     """Make what the sequence lacks; returns why it cannot be used, or nothing.
 
     Whatever goes wrong with one sequence stays with it, bugs included, whose trace is logged. A
-    full disk is raised.
+    full disk is raised, and MemoryError where memory ends, a GPU's or the machine's: others may
+    have held it, so the launcher tries again.
     """
     try:
         _prepare(unit)
@@ -112,6 +114,9 @@ def prepare_unit(unit: Unit) -> str:
             raise
         return f"sequence {unit.name}: {error}"
     except Exception as error:
+        if is_out_of_memory(error):
+            # What every launcher knows; torch's own is no MemoryError.
+            raise MemoryError(str(error).split("\n")[0]) from None
         LOG.exception("sequence %s is left out: %r", unit.name, error)
         return f"sequence {unit.name}: {type(error).__name__}: {error}"
     return ""

@@ -53,4 +53,5 @@ class DataPrepConfig:
     prep: PrepConfig = field(default_factory=PrepConfig)
     output: str = "outputs"
     workers: int | None = None
-    """Processes on this machine; null takes every core."""
+    """Processes on this machine; null takes every core, but one process where a network for depth
+    or matches runs on a GPU."""

@@ -33,6 +33,7 @@ class SlurmConfig(LauncherConfig):
     cpus: int = 1
     memory_gib: float = 4.0
     hours: float = 4.0
-    """Time limit of a task; what it has not finished then, the same command goes on with."""
+    """Time limit of a task. What it has not finished then is submitted again, an item a task; give
+    a share's time (`tasks` shares), or all its unfinished items wait for tasks of their own."""
     directives: dict[str, str] = field(default_factory=dict)
     """Further `sbatch` options by their long names, e.g. {constraint: avx512}."""

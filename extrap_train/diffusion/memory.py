@@ -14,6 +14,7 @@ from torch.utils._pytree import tree_leaves
 from torch.utils.weak import WeakIdKeyDictionary
 
 from extrap_train.config import ModelConfig, TrainerConfig
+from extrap_train.device import is_out_of_memory
 from extrap_train.diffusion.averages import TRACKED_WIDTHS
 from extrap_train.diffusion.denoiser import build_unet
 from extrap_train.diffusion.model import ExtrapolationModel
@@ -139,10 +140,7 @@ def advice_where_memory_ends(options: TrainerConfig) -> Iterator[None]:
     try:
         yield
     except (torch.OutOfMemoryError, MemoryError, RuntimeError) as error:
-        if not (
-            isinstance(error, torch.OutOfMemoryError | MemoryError)
-            or "can't allocate memory" in str(error)
-        ):
+        if not is_out_of_memory(error):
             raise
         raise InputError(
             f"out of memory at trainer.batch_size={options.batch_size}: {_remedies(options)}"

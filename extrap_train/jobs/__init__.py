@@ -15,7 +15,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class Died:
-    """In place of a result: the process that ran the job ended without one, and once more alone."""
+    """In place of a result: the job's process ended or had no memory left, and once more alone."""
 
     reason: str
 
@@ -30,6 +30,7 @@ class Launcher(Protocol):
         """Each item's index with its result, in the order in which they are done.
 
         An exception of a job is raised here and ends everything, so a job returns what the others
-        are to survive. A job that takes its process with it (memory) is tried once more, alone.
+        are to survive. A job that takes its process with it or raises MemoryError is tried once
+        more, alone.
         """
         ...

@@ -13,6 +13,7 @@ from extrap_train.jobs import Died, Item, Result
 
 WAITING_PER_WORKER = 2
 """Jobs that are handed out ahead of time: memory must not grow with the number of jobs."""
+_NO_MEMORY = "out of memory ({})"
 _ONE_THREAD = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 
 
@@ -43,24 +44,36 @@ class LocalLauncher:
         self, job: Callable[[Item], Result], items: Sequence[Item]
     ) -> Iterator[tuple[int, Result | Died]]:
         """See `Launcher`."""
-        if not self.apart and (self.workers == 1 or len(items) <= 1):
-            yield from ((index, job(item)) for index, item in enumerate(items))
-            return
-        suspects: list[int] = []
-        yield from self._run_in_pool(job, items, suspects)
+        suspects: dict[int, str] = {}
+        here = not self.apart and (self.workers == 1 or len(items) <= 1)
+        run = self._run_here if here else self._run_in_pool
+        yield from run(job, items, suspects)
+        if suspects:
+            self._close()  # its idle processes hold memory, too
         for index in suspects:
-            again: list[int] = []
+            again: dict[int, str] = {}
             with LocalLauncher(2) as alone:
                 yield from (
                     (index, result) for _, result in alone._run_in_pool(job, [items[index]], again)
                 )
-            if again:
-                yield index, Died("its process was killed, probably for want of memory")
+            yield from ((index, Died(reason)) for reason in again.values())
+
+    def _run_here(
+        self, job: Callable[[Item], Result], items: Sequence[Item], suspects: dict[int, str]
+    ) -> Iterator[tuple[int, Result]]:
+        """What has no memory goes to `suspects`, with its reason."""
+        for index, item in enumerate(items):
+            try:
+                result = job(item)
+            except MemoryError as error:
+                suspects[index] = _NO_MEMORY.format(error)
+            else:
+                yield index, result
 
     def _run_in_pool(
-        self, job: Callable[[Item], Result], items: Sequence[Item], suspects: list[int]
+        self, job: Callable[[Item], Result], items: Sequence[Item], suspects: dict[int, str]
     ) -> Iterator[tuple[int, Result]]:
-        """Whatever was under way when a process died goes to `suspects`."""
+        """What was under way when a process died goes to `suspects`, too."""
         running: dict[Future[Result], int] = {}
         waiting = iter(range(len(items)))
         try:
@@ -76,7 +89,9 @@ class LocalLauncher:
                     try:
                         result = future.result()
                     except BrokenProcessPool:
-                        suspects.append(index)
+                        suspects[index] = "its process was killed, probably for want of memory"
+                    except MemoryError as error:
+                        suspects[index] = _NO_MEMORY.format(error)
                     else:
                         yield index, result
         finally:

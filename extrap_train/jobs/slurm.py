@@ -41,7 +41,7 @@ class SubmittedLauncher:
         shares: Sequence[list[int]],
         died: dict[int, str],
     ) -> Iterator[tuple[int, Result]]:
-        """One array task a share; the items of a task that ended without a result go to `died`."""
+        """One array task a share; what ended without a result goes to `died`, with its reason."""
         from submitit.core.utils import (
             FailedJobError,
             FailedSubmissionError,
@@ -73,7 +73,11 @@ class SubmittedLauncher:
                     continue
                 if isinstance(results, BaseException):
                     raise results
-                yield from zip(share, results, strict=True)
+                for index, result in zip(share, results, strict=True):
+                    if isinstance(result, Died):
+                        died[index] = result.reason
+                    else:
+                        yield index, result
         finally:
             for task in submitted:
                 if not task.done():
@@ -82,12 +86,18 @@ class SubmittedLauncher:
 
 def _run_share(
     job: Callable[[Item], Result], items: Sequence[Item]
-) -> list[Result] | BaseException:
+) -> list[Result | Died] | BaseException:
     """The results, or what one job raised: as an object, which submitit would turn into text."""
+    results: list[Result | Died] = []
     try:
-        return [job(item) for item in items]
+        for item in items:
+            try:
+                results.append(job(item))
+            except MemoryError as error:
+                results.append(Died(f"out of memory ({error})"))
     except Exception as error:
         return error
+    return results
 
 
 def slurm_launcher(config: SlurmConfig, folder: Path) -> SubmittedLauncher:

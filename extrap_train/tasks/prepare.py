@@ -6,9 +6,9 @@ import hashlib
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from filelock import FileLock, Timeout
 
@@ -24,6 +24,7 @@ from extrap_train.config import (
     LauncherConfig,
     LocalConfig,
     MatcherConfig,
+    MonocularConfig,
     PrepConfig,
     SyntheticConfig,
 )
@@ -34,6 +35,7 @@ from extrap_train.jobs import Launcher
 from extrap_train.jobs.build import open_launcher
 
 LOCAL = LocalConfig()
+Options = TypeVar("Options", bound=DataConfig | DepthConfig | MatcherConfig)
 
 
 def prepare_category(
@@ -43,17 +45,22 @@ def prepare_category(
     prep: PrepConfig,
     *,
     output: Path,
-    workers: int,
+    workers: int | None,
     matcher: MatcherConfig,
     launcher: LauncherConfig = LOCAL,
     retry: bool = False,
 ) -> PreparedData:
     """Sequences of one category as pairs on disk; what is there already is used again.
 
-    With `retry`, sequences that failed before are tried again.
+    `workers` are local processes, None as many as suit (`Tools.default_workers`). With `retry`,
+    sequences that failed before are tried again. Paths are followed to where they lead, so that
+    other spellings of one are the same preparation.
     """
+    data, depth, matcher = _placed(data), _placed(depth), _placed(matcher)
     how = matcher if is_corrected(data, depth, prep) else None
-    Tools(depth, how).check()  # before anything is rendered
+    tools = Tools(depth, how)
+    tools.check()  # before anything is rendered
+    workers = workers or tools.default_workers()
     correction = asdict(how) if how else None
     frames_of = [category, _source(data), asdict(depth), prep.image_size]
     pairs_of = [*frames_of, pair_options(prep), correction]
@@ -114,6 +121,19 @@ def _sequences(
     assert isinstance(data, Co3dConfig)
     assert data.root is not None
     return read_category(Path(data.root), category), data.test_sequences
+
+
+def _placed(options: Options) -> Options:
+    """The same options with paths that lead to where theirs do, whatever they went through."""
+    placed: dict[str, Any] = {}
+    for name in ("root", "checkpoint"):
+        if path := getattr(options, name, None):
+            placed[name] = str(Path(path).resolve())
+    if isinstance(options, MonocularConfig):
+        if Path(options.model).is_dir():  # otherwise it is a name in the cache of downloads
+            placed["model"] = str(Path(options.model).resolve())
+        placed["matcher"] = _placed(options.matcher)
+    return replace(options, **placed)
 
 
 def _source(data: DataConfig) -> dict[str, Any]:

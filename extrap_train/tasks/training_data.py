@@ -1,6 +1,5 @@
 """The pairs that a category is trained on and measured on."""
 
-import os
 from pathlib import Path
 
 from extrap_train.config import TrainConfig
@@ -20,7 +19,7 @@ def prepared_data(config: TrainConfig) -> list[PreparedData]:
             config.depth,
             config.prep,
             output=Path(config.output),
-            workers=config.threads or len(os.sched_getaffinity(0)),
+            workers=config.threads,
             matcher=config.matcher,
         )
         for member in config.category.members

@@ -1,5 +1,6 @@
 import json
 import os
+import re
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +14,8 @@ from orbits import capture, even, ring, textured_capture
 from data_prep import pairs
 from data_prep.build import prepare
 from data_prep.frames import block_median, object_square
+from data_prep.tools import Tools
+from data_prep.unit import Unit, Workshop, prepare_unit
 from extrap_train.config import FlowMatcherConfig, PrepConfig
 from extrap_train.data import frame_files
 from extrap_train.data.store import PreparedData
@@ -287,3 +290,24 @@ def test_a_sequence_whose_process_died_is_named(
     reason = data.sequences.set_index("sequence").loc["cup/0000", "reason"]
     assert reason == "sequence cup/0000: its process was killed"
     assert f"left out: {reason}" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        torch.OutOfMemoryError("CUDA out of memory"),
+        MemoryError("Unable to allocate 3 GiB"),
+        RuntimeError("[enforce fail] . DefaultCPUAllocator: can't allocate memory: you tried"),
+    ],
+)
+def test_no_memory_is_the_launchers_to_try_again_not_the_sequences_fault(
+    error: Exception, tmp_path: Path
+) -> None:
+    @dataclass(frozen=True)
+    class Greedy(DatasetDepth):
+        def depth_maps(self, views: ListOf[View]) -> list[DepthMap]:
+            raise error
+
+    shop = Workshop(Tools(Greedy(), None), OPTIONS, tmp_path, tmp_path)
+    with pytest.raises(MemoryError, match=re.escape(str(error))):
+        prepare_unit(Unit(shop, captures(1)[0], "train", "key"))

@@ -8,11 +8,19 @@ from captures import write_capture
 from orbits import capture, even, ring
 
 from data_prep.build import prepare
-from extrap_train.config import Co3dConfig, DatasetDepthConfig, FlowMatcherConfig, PrepConfig
+from extrap_train.config import (
+    Co3dConfig,
+    DatasetDepthConfig,
+    FlowMatcherConfig,
+    LoftrMatcherConfig,
+    MonocularConfig,
+    PrepConfig,
+    SyntheticConfig,
+)
 from extrap_train.data.frame_files import frames_folder, pairs_folder
 from extrap_train.data.sequences import Sequence
 from extrap_train.data.store import PreparedData
-from extrap_train.tasks.prepare import prepare_category
+from extrap_train.tasks.prepare import _placed, prepare_category
 
 OPTIONS = PrepConfig(image_size=16)
 HELD_OUT = [4, 9, 14, 19]
@@ -87,6 +95,44 @@ def test_a_damaged_manifest_is_made_anew(tmp_path: Path, caplog: pytest.LogCaptu
     run(tmp_path, "cup", sequences, OPTIONS)
     assert "is damaged" in caplog.text
     assert manifest.read_bytes() == whole
+
+
+def test_one_data_set_has_one_preparation_however_its_path_is_spelt(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_capture(tmp_path / "co3d", ("one", "two"), 12)
+    (tmp_path / "link").symlink_to("co3d")
+    monkeypatch.chdir(tmp_path)
+    for root in ("co3d", "link", str(tmp_path / "co3d")):
+        prepare_category(
+            "cup",
+            Co3dConfig(root=root, test_sequences=1),
+            DatasetDepthConfig(),
+            PrepConfig(image_size=16, max_uses=2, max_gap_deg=40.0, correct=False),
+            output=tmp_path / "outputs",
+            workers=1,
+            matcher=FlowMatcherConfig(),
+        )
+    assert capsys.readouterr().out.count("prepared already") == 2
+    assert len(list((tmp_path / "outputs" / "data").glob("cup-*"))) == 1
+
+
+def test_weights_are_the_same_however_their_path_is_spelt(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "model").mkdir()
+    monkeypatch.chdir(tmp_path)
+    spelt, whole = (
+        MonocularConfig(
+            model=str(folder / "model"),
+            matcher=LoftrMatcherConfig(checkpoint=str(folder / "loftr.ckpt")),
+        )
+        for folder in (Path(), tmp_path)
+    )
+    assert _placed(spelt) == whole == _placed(whole)
+    named = MonocularConfig(matcher=FlowMatcherConfig())
+    assert _placed(named) == named
+    assert _placed(SyntheticConfig()) == SyntheticConfig()
 
 
 def test_a_changed_option_redoes_only_what_depends_on_it(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from kornia.feature import LoFTR
 from data_prep.tools import Tools, put_away
 from data_prep.unit import Unit, Workshop
 from extrap_train.config import (
+    FlowMatcherConfig,
     LoftrMatcherConfig,
     Mast3rConfig,
     PrepConfig,
@@ -123,3 +124,14 @@ def test_other_weights_under_the_same_name_are_other_tools(tmp_path: Path) -> No
     weights.write_bytes(b"others")
     assert len({absent, first, Tools(DatasetDepth(), options).correction_identity}) == 3
     assert Tools(DatasetDepth(), None).correction_identity == ""
+
+
+def test_processes_do_not_share_a_gpu_that_holds_a_network(
+    mast3r: Mast3rConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: range(8))
+    networks = Tools(mast3r, None), Tools(DatasetDepth(), LoftrMatcherConfig())
+    assert [tools.default_workers() for tools in networks] == [8, 8]
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    assert [tools.default_workers() for tools in networks] == [1, 1]
+    assert Tools(DatasetDepth(), FlowMatcherConfig()).default_workers() == 8

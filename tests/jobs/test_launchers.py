@@ -16,6 +16,7 @@ import pytest
 from extrap_train.config import SlurmConfig
 from extrap_train.errors import InputError
 from extrap_train.jobs import Died, Launcher
+from extrap_train.jobs.build import open_launcher
 from extrap_train.jobs.local import LocalLauncher
 from extrap_train.jobs.slurm import SubmittedLauncher, slurm_launcher
 
@@ -33,6 +34,15 @@ def square_or_die(number: int) -> int:
 def square_or_fill_the_disk(number: int) -> int:
     if number == 1:
         raise OSError(errno.ENOSPC, "no space")
+    return number * number
+
+
+def square_or_fill_the_memory(item: tuple[int, str]) -> int:
+    number, folder = item
+    before = len(list(Path(folder).glob(f"{number}-*")))
+    (Path(folder) / f"{number}-{before}").touch()
+    if number == 2 or (number == 1 and not before):
+        raise MemoryError("too large")
     return number * number
 
 
@@ -80,6 +90,26 @@ def test_a_job_that_takes_its_process_along_harms_no_other(kind: str, tmp_path: 
         done = dict(launcher.run(square_or_die, range(6)))
     assert isinstance(done.pop(3), Died)
     assert done == {i: i * i for i in range(6) if i != 3}
+
+
+def test_a_job_without_memory_is_tried_once_more_alone(launcher: Launcher, tmp_path: Path) -> None:
+    """As if two at once had filled the memory (1), and as if one were too large for it (2)."""
+    tried = tmp_path / "tried"
+    tried.mkdir()
+    done = dict(launcher.run(square_or_fill_the_memory, [(i, str(tried)) for i in range(4)]))
+    assert done == {0: 0, 1: 1, 2: Died("out of memory (too large)"), 3: 9}
+    count = {i: len(list(tried.glob(f"{i}-*"))) for i in range(4)}
+    assert count == {0: 1, 1: 2, 2: 2, 3: 1}
+
+
+def test_a_cluster_is_asked_for_with_the_first_jobs_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with open_launcher(SlurmConfig(), 1, tmp_path / "slurm") as launcher:
+        assert not (tmp_path / "slurm").exists()
+        with pytest.raises(InputError, match="no sbatch on this machine"):
+            list(launcher.run(square, [1]))
 
 
 def test_workers_do_not_outlive_a_killed_parent(tmp_path: Path) -> None:
