@@ -104,7 +104,8 @@ def pair_sheet(data: PreparedData, chosen: list[int], path: Path) -> None:
 
 
 def _batch(data: PreparedData, chosen: list[int]) -> PairBatch:
-    pairs = [data.pairs("train")[index] for index in chosen]
+    training = data.pairs("train")
+    pairs = [training[index] for index in chosen]
     views = [data.frames(p.sequence, [p.references[0], p.query]) for p in pairs]
     images = torch.stack([images for images, _, _ in views])
     depths = torch.stack([depths for _, depths, _ in views])

@@ -77,9 +77,7 @@ def corrections(
 
 
 @pytest.mark.slow
-def test_most_pairs_come_closer_and_none_gets_worse(
-    apple: PreparedData, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_most_pairs_come_closer(apple: PreparedData, monkeypatch: pytest.MonkeyPatch) -> None:
     default = correct.LEAST_GAIN
     monkeypatch.setattr(correct, "LEAST_GAIN", -1.0)
     found = [c for c in corrections(apple) if c.flow is not None]

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from data_prep.build import prepare
 from data_prep.report import coverage, write_report
-from data_prep.report_pairs import error_histogram
+from data_prep.report_pairs import error_histogram, pair_sheet
 from extrap_train.config import FlowMatcherConfig, PrepConfig
 from extrap_train.data.store import Pairs, PreparedData
 from extrap_train.depth.dataset import DatasetDepth
@@ -37,6 +37,17 @@ def test_the_page_says_what_was_kept_and_why_not(data: PreparedData) -> None:
     printed = console.export_text()
     assert "3 of 4" in printed
     assert "covers #°" in printed
+
+
+def test_the_table_of_pairs_is_read_once_for_all_pictures(
+    data: PreparedData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read, splits = PreparedData.pairs, []
+    monkeypatch.setattr(
+        PreparedData, "pairs", lambda self, split: splits.append(split) or read(self, split)
+    )
+    pair_sheet(data, [0, 1, 2], tmp_path / "sheet.png")
+    assert splits == ["train"]
 
 
 def test_its_pictures_are_there_and_not_blank(data: PreparedData) -> None:
