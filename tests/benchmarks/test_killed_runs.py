@@ -1,11 +1,11 @@
 """Killed workers and killed runs: the table ends as an undisturbed one's."""
 
 import os
-import random
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
@@ -39,33 +39,62 @@ def test_a_worker_that_is_killed_is_a_failed_cell_and_the_rest_goes_on(tmp_path:
     assert reasons.str.contains("killed").all()
 
 
+@pytest.fixture(scope="module")
+def calm(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, pd.DataFrame]:
+    """A folder of methods, and its table of a run that nobody has disturbed."""
+    folder = tmp_path_factory.mktemp("calm")
+    own = write_own(folder / "own")
+    result = _run(own, folder / "out", "dark,light")
+    assert result.returncode == 0, result.stderr
+    return own, _table(folder / "out")
+
+
 @pytest.mark.slow
-def test_runs_killed_at_random_moments_end_in_the_same_table(tmp_path: Path) -> None:
-    """`kill -9` of the whole run, and of one of its workers, ten times in turn."""
-    own = write_own(tmp_path / "own")
-    calm = _run(own, tmp_path / "calm", "dark,light")
-    assert calm.returncode == 0, calm.stderr
-    rng = random.Random(0)
-    for index in range(10):
-        output = tmp_path / f"killed{index}"
-        run = subprocess.Popen(
-            _command(own, output, "dark,light"),
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        time.sleep(rng.uniform(3, 25))
-        victim = _a_worker(run.pid) if index % 2 else run.pid
-        if victim is not None:
-            os.kill(victim, signal.SIGKILL)
-        run.wait()
-        again = _run(own, output, "dark,light")
-        assert again.returncode == 0, again.stderr
-        pd.testing.assert_frame_equal(_table(output), _table(tmp_path / "calm"))
+@pytest.mark.parametrize(
+    ("victim", "finished"),
+    # Once the last cell is there, workers end on their own, and the run writes its reports.
+    [*(("run", count) for count in range(5)), *(("worker", count) for count in range(4))],
+)
+def test_a_killed_run_ends_in_the_same_table(
+    victim: str, finished: int, calm: tuple[Path, pd.DataFrame], tmp_path: Path
+) -> None:
+    """`kill -9` of the whole run, or of one of its workers, at every stage: of four cells, so many
+    are there, and the others are under way.
+    """
+    own, undisturbed = calm
+    run = subprocess.Popen(
+        _command(own, tmp_path, "dark,light"), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+
+    def target() -> int | None:
+        there = len(list(tmp_path.glob("greys/cells/*/cell.json"))) >= finished
+        has_begun = there and (tmp_path / "greys" / "protocol.json").exists()
+        if not has_begun:
+            return None
+        return run.pid if victim == "run" else _a_worker(run.pid)
+
+    os.kill(_once_there(target, run), signal.SIGKILL)
+    assert run.wait() == (-signal.SIGKILL if victim == "run" else 0)
+    again = _run(own, tmp_path, "dark,light")
+    assert again.returncode == 0, again.stderr
+    pd.testing.assert_frame_equal(_table(tmp_path), undisturbed)
+
+
+def _once_there(target: Callable[[], int | None], run: subprocess.Popen[bytes]) -> int:
+    """The process to kill; a run that ends before there is one has disturbed nothing."""
+    while (pid := target()) is None:
+        assert run.poll() is None, "the run has ended before anything was killed"
+        time.sleep(0.002)
+    return pid
 
 
 def _a_worker(parent: int) -> int | None:
-    children = Path(f"/proc/{parent}/task/{parent}/children")
-    if not children.exists():
-        return None
-    pids = [int(pid) for pid in children.read_text().split()]
-    return pids[-1] if pids else None
+    """One that lives: not multiprocessing's tracker of resources, nor one that has ended."""
+    for pid in Path(f"/proc/{parent}/task/{parent}/children").read_text().split():
+        try:
+            command = Path(f"/proc/{pid}/cmdline").read_bytes()
+        except OSError:
+            continue
+        if b"spawn_main" in command:
+            return int(pid)
+    return None

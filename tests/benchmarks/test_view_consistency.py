@@ -86,9 +86,12 @@ def test_true_views_agree_better_than_moved_ones() -> None:
     assert warp_psnr(images.roll(3, dims=-1), depths, cameras) < floor - 3
 
 
-def test_views_from_opposite_sides_say_nothing() -> None:
-    views = [view_at(a, 32) for a in (0.0, 180.0)]
+@pytest.mark.parametrize(("angle_deg", "is_empty"), [(60.0, False), (180.0, True)])
+def test_views_from_opposite_sides_say_nothing(angle_deg: float, is_empty: bool) -> None:
+    """By the true depths: what one sees lies behind the ball, or the camera, of the other."""
+    views = [view_at(a, 32) for a in (0.0, angle_deg)]
     images = torch.stack([v.image for v in views])
     depths = torch.stack([v.depth for v in views if v.depth is not None])
-    narrow = stack_cameras([v.camera for v in views])
-    assert math.isnan(warp_psnr(images, torch.zeros_like(depths), narrow))
+    assert len(depths) == 2
+    cameras = stack_cameras([v.camera for v in views])
+    assert math.isnan(warp_psnr(images, depths, cameras)) == is_empty
