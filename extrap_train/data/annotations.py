@@ -133,6 +133,6 @@ def _optional_float(value: Any) -> float | None:
 def _typed(value: Any, kind: type, what: str) -> Any:
     if not isinstance(value, kind):
         raise TypeError(f"{what} is {value!r}, expected {kind.__name__}")
-    if kind is str and any("\ud800" <= letter <= "\udfff" for letter in value):
+    if isinstance(value, str) and any("\ud800" <= letter <= "\udfff" for letter in value):
         raise ValueError(f"{what} {value!a} is no Unicode")  # tables and hashes cannot take it
     return value

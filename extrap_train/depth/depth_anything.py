@@ -11,7 +11,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 from torch.nn import functional
 from transformers import AutoConfig, AutoImageProcessor, DepthAnythingForDepthEstimation
-from transformers.utils import cached_file
+from transformers.utils.hub import cached_file
 
 from extrap_train.device import fastest_device
 from extrap_train.errors import InputError
@@ -90,6 +90,8 @@ def files_read(model: str) -> list[Path]:
     try:
         config = cached_file(model, "config.json", local_files_only=True)
     except OSError:
+        config = None
+    if config is None:
         return []
     folder = Path(config).parent
     return sorted(file for pattern in _READ for file in folder.glob(pattern))
