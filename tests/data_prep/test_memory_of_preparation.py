@@ -102,33 +102,42 @@ def test_ten_thousand_sequences_stay_within_two_gibibytes(
         peaks[count] = peak_bytes(photographs, tmp_path / str(count))
         print(f"{count} sequences of {FRAMES} frames, MiB: {peaks[count]}")
     assert peaks[MANY]["all"] < MOST_BYTES >> 20
-    # Not the same: a shared page counts more for who is left once others have ended.
-    assert peaks[MANY]["worker"] < 1.05 * peaks[MANY // 10]["worker"]
+    # Its share of pages that are mapped from files hangs on what else runs on the machine.
+    assert peaks[MANY]["worker_heap"] < 1.05 * peaks[MANY // 10]["worker_heap"]
 
 
 def peak_bytes(photographs: Path, output: Path) -> dict[str, int]:
-    """Most memory in MiB of a preparation with two workers; shared pages are counted in parts."""
+    """Most memory in MiB of a preparation with two workers; shared pages are counted in parts, but
+    not in a worker's heap.
+    """
     options = ["category=cup", "data=co3d", f"data.root={photographs}", f"output={output}"]
     tiny = ["prep.image_size=8", "prep.correct=false", "workers=2"]
     command = [sys.executable, "-m", "data_prep", *options, *tiny]
     said = output.with_suffix(".log")
     with said.open("w") as log:
         run = subprocess.Popen(command, stdout=log, stderr=log)
-    peaks = dict.fromkeys(("parent", "worker", "all"), 0)
+    peaks: dict[str, int] = {}
     while run.poll() is None:
         children = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()
-        own, workers = share_mib(run.pid), [share_mib(int(child)) for child in children]
-        now = {"parent": own, "worker": max(workers, default=0), "all": own + sum(workers)}
-        peaks = {who: max(peak, now[who]) for who, peak in peaks.items()}
+        own, workers = memory_mib(run.pid), [memory_mib(int(child)) for child in children]
+        now = {
+            "parent": own["Pss"],
+            "worker": max((each["Pss"] for each in workers), default=0),
+            "worker_heap": max((each["Anonymous"] for each in workers), default=0),
+            "all": own["Pss"] + sum(each["Pss"] for each in workers),
+        }
+        peaks = {who: max(peaks.get(who, 0), value) for who, value in now.items()}
         time.sleep(0.5)
     assert run.returncode == 0, said.read_text()[-2000:]
     return peaks
 
 
-def share_mib(pid: int) -> int:
-    """A process's proportional share of resident memory; 0 once it has ended."""
+def memory_mib(pid: int) -> dict[str, int]:
+    """A process's proportional share of resident memory, and what of it no file holds; 0 once it
+    has ended.
+    """
     try:
         text = Path(f"/proc/{pid}/smaps_rollup").read_text()
     except OSError:
-        return 0
-    return int(text.split("Pss:")[1].split()[0]) >> 10
+        return {"Pss": 0, "Anonymous": 0}
+    return {name: int(text.split(f"{name}:")[1].split()[0]) >> 10 for name in ("Pss", "Anonymous")}
