@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
-from pathlib import Path
 
 from jaxtyping import Float
 from torch import Tensor
@@ -148,11 +147,6 @@ def missing_networks(config: ScoringConfig) -> dict[str, str]:
         except InputError as error:
             reasons[name] = str(error)
     return reasons
-
-
-def scoring_files(config: ScoringConfig) -> list[Path]:
-    """The files of weights that the user has named."""
-    return [Path(config.lpips_weights[n]) for n in config.lpips if n in config.lpips_weights]
 
 
 def megascenes_compat(images: Float[Tensor, "n 3 h w"], truth: Truth) -> dict[str, Score]:
