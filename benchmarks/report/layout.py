@@ -1,6 +1,5 @@
 """What a printed table shows, before it is Markdown, LaTeX or HTML."""
 
-from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,6 +8,7 @@ import pandas as pd
 from benchmarks.cells import OK
 from benchmarks.chance import FEWEST_CAPTURES
 from benchmarks.columns import direction
+from benchmarks.report.given import given_notes
 from benchmarks.results import Results
 
 NAMES = {
@@ -220,26 +220,5 @@ def _notes(results: Results) -> list[str]:
         f"{FEWEST_CAPTURES} captures nothing can). A mean that lacks cells says how many it has of "
         "how many, and is not ranked.",
         "Time: " + "; ".join(f"{title}: {meaning}" for title, meaning in times.items()) + ".",
-        *_given(results),
+        *given_notes(results),
     ]
-
-
-def _given(results: Results) -> list[str]:
-    """What each method used, for the reader who wants to know whether the race was fair."""
-    used: dict[str, dict[str, Counter[str]]] = {}
-    for cell in results.cells:
-        if cell["status"] == OK:
-            for name, value in cell["given"].items():
-                used.setdefault(cell["method"], {}).setdefault(name, Counter())[value] += 1
-    lines = [
-        f"{method} — {', '.join(f'{name}: {_counted(values)}' for name, values in words.items())}"
-        for method, words in used.items()
-    ]
-    return ["Given: " + "; ".join(lines) + "."] if lines else []
-
-
-def _counted(values: Counter[str]) -> str:
-    """With the number of cells where they are not all alike."""
-    if len(values) == 1:
-        return next(iter(values))
-    return " / ".join(f"{value} ({count} cells)" for value, count in sorted(values.items()))

@@ -134,6 +134,17 @@ def test_what_was_given_is_said_of_everycell() -> None:
     assert "Given: ours — depth: used, ended: steps (2 cells) / time (1 cells)." in notes
 
 
+def test_what_differs_in_its_numbers_only_is_said_once() -> None:
+    table = results(
+        cell("ours", "0", 0, 30.0, init="9 points of 2 inputs, 0.5 random"),
+        cell("ours", "1", 0, 30.0, init="120 points of 2 inputs, 0.25 random"),
+        cell("ours", "2", 0, 30.0, init="none"),
+    )
+    notes = "\n".join(lay_out(table, None).notes)
+    ranges = "9 to 120 points of 2 inputs, 0.25 to 0.5 random (2 cells)"
+    assert f"Given: ours — init: {ranges} / none (1 cells)." in notes
+
+
 def _layout() -> Layout:
     rows = [
         Row("A & B", "one", [Entry("30.00", 30.0, 1), Entry("–", None)]),
