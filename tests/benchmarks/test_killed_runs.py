@@ -51,30 +51,36 @@ def calm(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, pd.DataFrame]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("victim", "finished"),
+    "kills",
     # Once the last cell is there, workers end on their own, and the run writes its reports.
-    [*(("run", count) for count in range(5)), *(("worker", count) for count in range(4))],
+    [
+        *([("run", count)] for count in range(5)),
+        *([("worker", count)] for count in range(4)),
+        [("worker", 0), ("run", 2)],
+    ],
+    ids=lambda kills: "-".join(f"{victim}{finished}" for victim, finished in kills),
 )
 def test_a_killed_run_ends_in_the_same_table(
-    victim: str, finished: int, calm: tuple[Path, pd.DataFrame], tmp_path: Path
+    kills: list[tuple[str, int]], calm: tuple[Path, pd.DataFrame], tmp_path: Path
 ) -> None:
-    """`kill -9` of the whole run, or of one of its workers, at every stage: of four cells, so many
-    are there, and the others are under way.
+    """`kill -9` of one of its workers, of the whole run, or of one after the other, at every stage:
+    of four cells, so many are there, and the others are under way.
     """
     own, undisturbed = calm
     run = subprocess.Popen(
         _command(own, tmp_path, "dark,light"), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
 
-    def target() -> int | None:
+    def target(victim: str, finished: int) -> int | None:
         there = len(list(tmp_path.glob("greys/cells/*/cell.json"))) >= finished
         has_begun = there and (tmp_path / "greys" / "protocol.json").exists()
         if not has_begun:
             return None
         return run.pid if victim == "run" else _a_worker(run.pid)
 
-    os.kill(_once_there(target, run), signal.SIGKILL)
-    assert run.wait() == (-signal.SIGKILL if victim == "run" else 0)
+    for kill in kills:
+        os.kill(_once_there(lambda kill=kill: target(*kill), run), signal.SIGKILL)
+    assert run.wait() == (-signal.SIGKILL if kills[-1][0] == "run" else 0)
     again = _run(own, tmp_path, "dark,light")
     assert again.returncode == 0, again.stderr
     pd.testing.assert_frame_equal(_table(tmp_path), undisturbed)
