@@ -26,7 +26,6 @@ from benchmarks.scoring import Score, score_files
 from extrap_train.config import MethodConfig, ScoringConfig
 from extrap_train.data.files import write_whole
 from extrap_train.data.json_files import read_json
-from extrap_train.errors import InputError
 
 OK, FAILED, UNAVAILABLE = "ok", "failed", "unavailable"
 _DRAW = ("category", "sequence", "n_views", "draw", "seed")
@@ -140,28 +139,6 @@ def write_cell(folder: Path, record: Mapping[str, Any], files: Mapping[str, byte
         workshop.replace(folder)
     finally:
         shutil.rmtree(workshop, ignore_errors=True)
-
-
-def read_cell(folder: Path) -> dict[str, Any] | None:
-    """A cell's record; None where there is none. Raises InputError where it is damaged."""
-    if not (folder / "cell.json").is_file():
-        return None
-    record = read_json(folder / "cell.json")
-    if not isinstance(record, dict) or record.get("key") != folder.name or not _is_whole(record):
-        raise InputError(f"{folder / 'cell.json'}: is no record of this cell")
-    for name, stated in (record.get("images", {}) | record.get("points", {})).items():
-        file = folder / name
-        if not file.is_file() or hashlib.sha256(file.read_bytes()).hexdigest() != stated:
-            raise InputError(f"{file}: is missing, or not what its cell's hash says")
-    return record
-
-
-def _is_whole(record: Mapping[str, Any]) -> bool:
-    """Whether it has every entry that is read from a cell of its status."""
-    needed = {"method", "status", "reason", "scene", "device", "hashes", *_DRAW}
-    if record.get("status") == OK:
-        needed |= {"metrics", "images", "points", *MEASURED}
-    return needed <= record.keys()
 
 
 def scores_of(record: Mapping[str, Any]) -> dict[str, Score]:

@@ -2,6 +2,7 @@
 which is not. Results come from elsewhere, too: names in them lead to no other folder.
 """
 
+import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any, cast
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from benchmarks.cells import FAILED, OK, UNAVAILABLE, read_cell
+from benchmarks.cells import FAILED, OK, UNAVAILABLE
 from extrap_train.config import TableConfig
 from extrap_train.data.json_files import read_json
 from extrap_train.errors import InputError
@@ -114,9 +115,15 @@ def read_record(folder: Path) -> dict[str, Any] | None:
         return None
     record = read_json(file)
     _require(record, _CELL, file, "record of this cell")
-    if record["status"] == OK:
+    if record["key"] != folder.name:
+        raise InputError(f"{file}: is the record of the cell {record['key']}")
+    if record["status"] == OK or {"images", "points"} & record.keys():
         _require(record, _FINISHED, file, "record of this cell")
-    return read_cell(folder)
+    for name, stated in (record.get("images", {}) | record.get("points", {})).items():
+        held = folder / name
+        if not held.is_file() or hashlib.sha256(held.read_bytes()).hexdigest() != stated:
+            raise InputError(f"{held}: is missing, or not what its cell's hash says")
+    return cast(dict[str, Any], record)
 
 
 def read_plan(file: Path) -> dict[str, Any]:
