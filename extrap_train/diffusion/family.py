@@ -94,8 +94,10 @@ class MegaScenes:
     ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b z h w"]]:
         """See `Family.latents`; the warp is not encoded but shrunk to the latents' size."""
         reference = autoencoder.encode_reference(batch.reference_images[:, 0])
-        warp = _nearest_warp(batch)
-        shrunk = lanczos_resize(warp.image, *reference.shape[-2:]).clamp(0, 1) * 2 - 1
+        # Geometry keeps its precision where the caller lets the network run in less.
+        with torch.autocast(reference.device.type, enabled=False):
+            warp = _nearest_warp(batch)
+            shrunk = lanczos_resize(warp.image, *reference.shape[-2:]).clamp(0, 1) * 2 - 1
         base = torch.zeros_like(reference)
         if config.residual:
             base = autoencoder.encode(filled_warp(warp))

@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import pytest
 import torch
+from batches import batch_of
 
 from extrap_train.config import ModelConfig, SamplerConfig
 from extrap_train.data.module import with_warp
 from extrap_train.diffusion.conditioning import filled_warp
+from extrap_train.diffusion.family import FAMILIES
 from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sample_views, view_generator
@@ -37,6 +39,21 @@ def test_a_published_family_trains_and_samples(
     generators = [view_generator(0, name) for name in "abc"]
     image = sample_views(model, batch, SamplerConfig(steps=3, guidance=2.0), generators)
     assert image.shape == batch.image.shape
+
+
+@pytest.mark.parametrize("references", [1, 3])
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_condition_keeps_its_precision_where_the_network_runs_in_less(
+    config: ModelConfig, family: str, references: int
+) -> None:
+    """What the small model's networks do not make is the same to the bit: latents are pixels."""
+    model, batch = _model(config, family), batch_of(2, references=references)
+    exact = model.condition(batch)
+    with torch.autocast("cpu", torch.bfloat16):
+        lower = model.condition(batch)
+    assert torch.equal(lower.latents, exact.latents)
+    assert torch.equal(lower.base, exact.base)
+    assert torch.equal(lower.embedding[:, -19:], exact.embedding[:, -19:])
 
 
 def test_zeronvs_sees_the_nearest_reference_alone(config: ModelConfig, batch: PairBatch) -> None:
