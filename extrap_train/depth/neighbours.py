@@ -33,8 +33,11 @@ def choose_neighbours(
     rights = torch.stack([camera.world_to_cam[0, :3] for camera in cameras])
     on_right = ((positions[None] - positions[:, None]) * rights[:, None]).sum(-1) > 0
     if center is None:
-        badness = torch.cdist(positions, positions)
-        badness = torch.where(badness > 0, badness, torch.inf)
+        # From differences: products, which `cdist` takes for many, drown them far from the origin.
+        distance = torch.cdist(
+            positions, positions, compute_mode="donot_use_mm_for_euclid_dist"
+        ).fill_diagonal_(torch.inf)
+        badness = torch.where(distance > 0, distance, torch.inf)
     else:
         badness = _badness(positions - center, limit_rad)
     return [_by_turns(badness[i], on_right[i], count) for i in range(len(cameras))]
