@@ -62,6 +62,10 @@ def _error(arguments: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
         ),
         (["category=hydrant", "model.patch=7"], "no multiple of 56"),
         (["category=hydrant", "data=co3d"], "give data.root=FOLDER"),
+        (
+            ["category=hydrant", "model=small_megascenes", "model.references=3"],
+            "told of the nearest alone: give model.references=1",
+        ),
         (["category=hydrant", "sampler.solver=heun"], "known: ddim, dpmpp, unipc"),
         (["category=hydrant", "sampler.solver=unipc", "sampler.eta=1"], "need sampler.solver=ddim"),
         (["category=hydrant", "sampler.guidance_interval=[0.8,0.2]"], "0 ≤ lowest ≤ highest ≤ 1"),

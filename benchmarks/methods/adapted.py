@@ -48,7 +48,7 @@ class AdaptedDiffusion(Diffusion):
             done = adapt(
                 model,
                 adapter,
-                ScenePairs(views, model.config.references),
+                ScenePairs(views, model.config.told_references),
                 options,
                 self.sampler,
                 seconds=60 * self.lora_minutes,

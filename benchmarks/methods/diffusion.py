@@ -13,7 +13,7 @@ from torch.nn import functional
 from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis, Unavailable, photographs_used
 from benchmarks.methods.checks import check_range
 from benchmarks.methods.references import views_with_depth
-from extrap_train.config import SamplerConfig
+from extrap_train.config import NEAREST_ALONE, SamplerConfig
 from extrap_train.diffusion.checkpoint import load_model
 from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.diffusion.model import ExtrapolationModel
@@ -55,6 +55,11 @@ class Diffusion:
         """InputError for the first option that cannot be meant."""
         if self.references is not None:
             check_range("references", self.references, 1)
+            if self.references > 1 and self.family in NEAREST_ALONE:
+                raise InputError(
+                    f"references={self.references}, but {self.family} is told of the nearest input "
+                    "alone: leave references= out"
+                )
 
     @property
     def sampler(self) -> SamplerConfig:

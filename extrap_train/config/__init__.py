@@ -42,6 +42,7 @@ from extrap_train.config.matching import (
 )
 from extrap_train.config.model import (
     FAMILIES,
+    NEAREST_ALONE,
     ClipConfig,
     ModelConfig,
     SamplerConfig,
@@ -59,6 +60,7 @@ __all__ = [
     "FAMILIES",
     "LPIPS_NETS",
     "MISSING",
+    "NEAREST_ALONE",
     "AlikedMatcherConfig",
     "CapturesConfig",
     "CategoryConfig",

@@ -7,7 +7,7 @@ from typing import Any
 
 from extrap_train.config.commands import DataPrepConfig, TrainConfig
 from extrap_train.config.data import Co3dConfig, PrepConfig
-from extrap_train.config.model import FAMILIES, ModelConfig, SamplerConfig
+from extrap_train.config.model import FAMILIES, NEAREST_ALONE, ModelConfig, SamplerConfig
 from extrap_train.config.training import TrainerConfig
 from extrap_train.config.tree import dotted
 from extrap_train.errors import InputError
@@ -175,6 +175,11 @@ def _check_model(model: ModelConfig, prep: PrepConfig) -> None:
         raise InputError(
             "model.residual=true needs a warp, which model.family=zeronvs is not told: give "
             "model.residual=false"
+        )
+    if model.references > 1 and model.family in NEAREST_ALONE:
+        raise InputError(
+            f"model.references={model.references}, but model.family={model.family} is told of the "
+            "nearest alone: give model.references=1"
         )
     if prep.image_size != model.warp_size:
         raise InputError(

@@ -6,6 +6,8 @@ from extrap_train.config.tree import MISSING
 
 FAMILIES = ("zeronvs", "megascenes", "ours")
 """What a denoiser may be told about the query view; `extrap_train.diffusion.family` has each."""
+NEAREST_ALONE = ("zeronvs", "megascenes")
+"""Families that are told of the nearest reference and of no other."""
 
 
 @dataclass
@@ -63,7 +65,9 @@ class ModelConfig:
     clip: ClipConfig | None = None
     """Encoder of the reference image; null takes a small one that is trained along."""
     references: int = 3
-    """Most references that a view is warped from (paper III-A.4)."""
+    """Most references that a view is warped from (paper III-A.4); 1 for the families that are told
+    of the nearest alone.
+    """
     octaves: int = 4
     """Of the positional encoding: 4 channels each."""
     geometry: bool = False
@@ -99,6 +103,11 @@ class ModelConfig:
     def warp_size(self) -> int:
         """Side of the references and of the warp between them, in pixels."""
         return self.warp_scale * self.image_size
+
+    @property
+    def told_references(self) -> int:
+        """`references`, and 1 for the families that are told of no more, whatever it says."""
+        return 1 if self.family in NEAREST_ALONE else self.references
 
 
 @dataclass

@@ -84,22 +84,28 @@ def filled_warp(warp: Warp) -> Float[Tensor, "b 3 h w"]:
     return fill_holes(warp.image - 0.5, warp.mask) + 0.5
 
 
+def warp_of(batch: PairBatch) -> Warp:
+    """The batch's warp; ValueError where it has none yet."""
+    if batch.warp is None:
+        raise ValueError("the batch has no warp yet: call `with_warp` first")
+    return batch.warp
+
+
 def concatenated_latents(
     batch: PairBatch, autoencoder: Autoencoder, octaves: int
 ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b z h w"]]:
     """The channels behind the noisy latent, and the filled warp's latent among them."""
-    if batch.warp is None:
-        raise ValueError("the batch has no warp yet: call `with_warp` first")
+    warp = warp_of(batch)
     reference = autoencoder.encode_reference(batch.reference_images[:, 0])
-    warped = autoencoder.encode(filled_warp(batch.warp))
+    warped = autoencoder.encode(filled_warp(warp))
     height, width = reference.shape[-2:]
     grid = coordinate_grid(height, width).to(reference).expand(len(reference), -1, -1, -1)
     channels = [
         reference,
         warped,
         positional_encoding(grid, octaves),
-        _encode_warped(batch.warp, octaves, autoencoder.factor),
-        functional.avg_pool2d(batch.warp.mask[:, None], autoencoder.factor),
+        _encode_warped(warp, octaves, autoencoder.factor),
+        functional.avg_pool2d(warp.mask[:, None], autoencoder.factor),
     ]
     return torch.cat(channels, 1), warped
 

@@ -25,10 +25,10 @@ from extrap_train.diffusion.conditioning import (
     condition_channels,
     filled_warp,
     geometry_channels,
+    warp_of,
 )
 from extrap_train.diffusion.pose_encoding import depth_scale, megascenes_pose, zeronvs_pose
 from extrap_train.geometry.resample import lanczos_resize
-from extrap_train.geometry.warp import warp_references
 from extrap_train.views import PairBatch, Warp
 
 
@@ -94,9 +94,9 @@ class MegaScenes:
     ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b z h w"]]:
         """See `Family.latents`; the warp is not encoded but shrunk to the latents' size."""
         reference = autoencoder.encode_reference(batch.reference_images[:, 0])
-        # Geometry keeps its precision where the caller lets the network run in less.
+        warp = _nearest_warp(batch)
+        # What is no network keeps its precision where the caller lets the network run in less.
         with torch.autocast(reference.device.type, enabled=False):
-            warp = _nearest_warp(batch)
             shrunk = lanczos_resize(warp.image, *reference.shape[-2:]).clamp(0, 1) * 2 - 1
         base = torch.zeros_like(reference)
         if config.residual:
@@ -129,8 +129,7 @@ class Ours:
         """See `Family.latents`."""
         latents, warped = concatenated_latents(batch, autoencoder, config.octaves)
         if config.geometry:
-            assert batch.warp is not None
-            told = geometry_channels(batch.warp, _zeronvs_scale(batch), autoencoder.factor)
+            told = geometry_channels(warp_of(batch), _zeronvs_scale(batch), autoencoder.factor)
             latents = torch.cat([latents, told], 1)
         return latents, warped if config.residual else torch.zeros_like(warped)
 
@@ -144,16 +143,13 @@ class Ours:
 
 
 def _nearest_warp(batch: PairBatch) -> Warp:
-    """Of the nearest reference alone: the batch's own, at its finer size, where it has no other."""
-    if batch.warp is not None and batch.reference_images.shape[1] == 1:
-        return batch.warp
-    return warp_references(
-        batch.reference_images[:, :1],
-        batch.reference_depths[:, :1],
-        batch.reference_cameras[:, :1],
-        batch.reference_valid[:, :1],
-        batch.camera,
-    )
+    """The batch's warp, which must be of the nearest reference alone: made at the finer size and
+    corrected as every other, which cannot be made up for once the batch is reduced.
+    """
+    columns = batch.reference_images.shape[1]
+    if columns != 1:
+        raise ValueError(f"{columns} references for a model that is told of the nearest alone")
+    return warp_of(batch)
 
 
 FAMILIES: dict[str, Family] = {"zeronvs": ZeroNvs(), "megascenes": MegaScenes(), "ours": Ours()}

@@ -119,7 +119,7 @@ class DiffusionGenerator:
         joint_views: int,
     ) -> GeneratedViews:
         config = self.model.config
-        size, most = config.warp_size, self.references or config.references
+        size, most = config.warp_size, self.references or config.told_references
         device = next(self.model.parameters()).device
         # Geometry keeps its precision where the caller lets the network run in less.
         with torch.autocast(device.type, enabled=False):

@@ -43,7 +43,7 @@ def run(config: TrainConfig) -> Path:
     fabric = fabric_of(config)
     model = trained_model(config).to(fabric.device)
     inputs = open_inputs(config, model.config.warp_size)
-    pairs = ScenePairs(inputs.views, model.config.references)
+    pairs = ScenePairs(inputs.views, model.config.told_references)
     folder = Path(config.output) / "scene" / inputs.label
     asked = _asked(config, inputs)
     if config.resume and _is_done(folder, asked):

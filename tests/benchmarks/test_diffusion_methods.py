@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -236,13 +237,14 @@ def test_missing_weights_say_how_to_make_them(name: str) -> None:
     ("options", "said"),
     [
         ({"references": 0}, "references=0: must be at least 1"),
+        ({"family": "zeronvs", "references": 2}, "zeronvs is told of the nearest input alone"),
         ({"lora_steps": 0}, "lora_steps=0: must be at least 1"),
         ({"lora_minutes": 0.0}, r"lora_minutes=0.0: must be at least 0.001"),
     ],
 )
-def test_an_option_that_cannot_be_meant_is_refused(options: dict[str, float], said: str) -> None:
+def test_an_option_that_cannot_be_meant_is_refused(options: dict[str, Any], said: str) -> None:
     with pytest.raises(InputError, match=said):
-        AdaptedDiffusion(**options)  # type: ignore[arg-type]
+        AdaptedDiffusion(**options)
 
 
 def test_the_ablations_rows_run_as_their_files_say(weights: str, tmp_path: Path) -> None:

@@ -2,11 +2,12 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 from orbits import ring
 from torch import nn
 
-from extrap_train.config import ModelConfig, SamplerConfig
+from extrap_train.config import NEAREST_ALONE, ModelConfig, SamplerConfig
 from extrap_train.diffusion.generator import DiffusionGenerator, ViewGenerator
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.views import Camera, View
@@ -50,6 +51,22 @@ def test_fewer_references_than_the_models_may_be_asked_for(config: ModelConfig) 
     all_three = _generator(config, 8).generate(views, queries, ["a", "b"])
     assert [len(row) for row in all_three.references] == [3, 3]
     assert one.warp.mask.sum() < all_three.warp.mask.sum()
+
+
+@pytest.mark.parametrize("family", NEAREST_ALONE)
+def test_who_is_told_of_the_nearest_alone_makes_its_warp_as_of_one_view(
+    config: ModelConfig, family: str
+) -> None:
+    """At the finer size, then reduced, whatever number of references the configuration says."""
+    views = _views(ring(torch.tensor([0.0, 40.0, 80.0]).numpy()))
+    query = ring(torch.tensor([10.0]).numpy())
+    config = replace(config, family=family, residual=False)
+    several, one = (_generator(replace(config, references=count), 8) for count in (3, 1))
+    made = several.generate(views, query, ["a"])
+    alone = one.generate(views[:1], query, ["a"])
+    assert made.references == [(0,)]
+    assert torch.equal(made.warp.image, alone.warp.image)
+    assert torch.equal(made.images, alone.images)
 
 
 def test_seed_and_name_choose_the_noise(config: ModelConfig) -> None:

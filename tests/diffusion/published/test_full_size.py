@@ -23,6 +23,11 @@ def _layout(folder: Path, family: str) -> dict[str, Tensor]:
     return {name: torch.empty(shape, device="meta") for name, shape in names.items()}
 
 
+@pytest.mark.parametrize("model", ["zeronvs", "megascenes"])
+def test_one_reference_is_loaded_where_one_is_told(model: str) -> None:
+    assert configured(model).references == configured(model).told_references == 1
+
+
 @pytest.mark.parametrize(
     ("layout", "model", "denoiser_parameters"),
     [
