@@ -12,7 +12,7 @@ from typing import Any
 import torch
 import yaml
 
-from extrap_train.config import SceneOptions, SyntheticConfig, TrainConfig, dotted
+from extrap_train.config import SceneOptions, SyntheticConfig, TrainConfig, dotted, sampler_for
 from extrap_train.data.files import partial_beside, write_whole
 from extrap_train.errors import InputError
 
@@ -27,10 +27,12 @@ _NOT_PART_OF_THE_RUN = (
     "trainer.compile",
     "complete",
     "average_width",
+    "model.sampler",
     *(field.name for field in fields(SceneOptions)),
 )
 """May differ on resume: where things lie, how they are measured, how long is trained, how the
-machine goes about the same mathematics, and what other tasks read.
+machine goes about the same mathematics, and what other tasks read. What the model recommends to
+sample with is part of the run as far as it is used, under `sampler`.
 """
 
 _ADDED = {"model.joint_views": 1}
@@ -83,9 +85,14 @@ def run_identity(config: TrainConfig) -> dict[str, Any]:
         left_out.append("data.root")
     return {
         key: value
-        for key, value in dotted(asdict(config)).items()
+        for key, value in dotted(_said(config)).items()
         if not any(key == name or key.startswith(f"{name}.") for name in left_out)
     }
+
+
+def _said(config: TrainConfig) -> dict[str, Any]:
+    """All options, with the sampler as it is used: what the model recommends is spelled out."""
+    return asdict(config) | {"sampler": asdict(sampler_for(config.sampler, config.model))}
 
 
 def _digest(identity: dict[str, Any]) -> str:
@@ -109,7 +116,7 @@ def open_run(config: TrainConfig) -> RunFolder:
         _check_same(saved, identity, config)
     if not config.resume:
         _start_over(path)
-    write_whole(saved, yaml.safe_dump(asdict(config), sort_keys=False).encode())
+    write_whole(saved, yaml.safe_dump(_said(config), sort_keys=False).encode())
     return RunFolder(path)
 
 
@@ -161,6 +168,8 @@ def _check_same(saved: Path, identity: dict[str, Any], config: TrainConfig) -> N
 
 def _default(config: Any, key: str) -> Any:
     """What the dataclass that holds the option starts it with."""
+    if key.startswith("sampler."):
+        key = f"model.{key}"  # whose default is a value; the command's is to say nothing
     *parents, name = key.split(".")
     for parent in parents:
         config = getattr(config, parent)

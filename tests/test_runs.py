@@ -11,6 +11,8 @@ from extrap_train.config import (
     Co3dConfig,
     FlowMatcherConfig,
     ModelConfig,
+    SamplerConfig,
+    SamplerOptions,
     SyntheticConfig,
     TrainConfig,
 )
@@ -78,6 +80,18 @@ def test_an_option_that_is_new_since_had_its_default(config: TrainConfig) -> Non
     changed = replace(config.trainer, power_averages=True)
     with pytest.raises(InputError, match=r"power_averages \(was False, now True\)"):
         open_run(replace(config, run="mine", trainer=changed))
+
+
+def test_what_a_model_recommends_is_part_of_the_run_as_far_as_it_is_used(
+    config: TrainConfig,
+) -> None:
+    """Said by the command or by the model: the same run, and its file spells it out."""
+    said = replace(config, sampler=SamplerOptions(steps=50))
+    model = replace(config.model, sampler=SamplerConfig(steps=50))
+    run = open_run(said)
+    assert open_run(replace(config, model=model)) == run != open_run(config)
+    assert open_run(replace(said, model=replace(model, sampler=SamplerConfig(steps=9)))) == run
+    assert yaml.safe_load((run.path / "config.yaml").read_text())["sampler"]["steps"] == 50
 
 
 def test_starting_over_forgets_the_finished_run(config: TrainConfig) -> None:

@@ -50,7 +50,7 @@ class AdaptedDiffusion(Diffusion):
                 adapter,
                 ScenePairs(views, model.config.told_references),
                 options,
-                self.sampler,
+                self.sampler(model),
                 seconds=60 * self.lora_minutes,
                 seed=inputs.seed,
                 fabric=Fabric(accelerator=device, devices=1, plugins=alone),

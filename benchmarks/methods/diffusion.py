@@ -13,7 +13,7 @@ from torch.nn import functional
 from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis, Unavailable, photographs_used
 from benchmarks.methods.checks import check_range
 from benchmarks.methods.references import views_with_depth
-from extrap_train.config import NEAREST_ALONE, SamplerConfig
+from extrap_train.config import NEAREST_ALONE, SamplerConfig, SamplerOptions, sampler_for
 from extrap_train.diffusion.checkpoint import load_model
 from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.diffusion.model import ExtrapolationModel
@@ -47,9 +47,10 @@ class Diffusion:
     """
     references: int | None = None
     """Most inputs that a target is warped from; null takes the model's number."""
-    steps: int = 2
-    guidance: float = 1.0
-    eta: float = 0.0
+    steps: int | None = None
+    """Of the sampler, as `guidance` and `eta` are; null is what the model recommends."""
+    guidance: float | None = None
+    eta: float | None = None
 
     def __post_init__(self) -> None:
         """InputError for the first option that cannot be meant."""
@@ -61,10 +62,10 @@ class Diffusion:
                     "alone: leave references= out"
                 )
 
-    @property
-    def sampler(self) -> SamplerConfig:
+    def sampler(self, model: ExtrapolationModel) -> SamplerConfig:
         """How every view is sampled."""
-        return SamplerConfig(steps=self.steps, guidance=self.guidance, eta=self.eta)
+        said = SamplerOptions(steps=self.steps, guidance=self.guidance, eta=self.eta)
+        return sampler_for(said, model.config)
 
     def weight_files(self, category: str) -> Sequence[Path]:
         """The files of the model's folder."""
@@ -107,13 +108,14 @@ class Diffusion:
 
     def generator(self, model: ExtrapolationModel) -> DiffusionGenerator:
         """What paints views with this method's options."""
-        return DiffusionGenerator(model, self.sampler, references=self.references)
+        return DiffusionGenerator(model, self.sampler(model), references=self.references)
 
     def _warm_up(self, model: ExtrapolationModel, inputs: SceneInputs) -> None:
         """Paint in one step: the first pictures of a process, and of each shape, wait for kernels
         to be compiled and chosen, which would fall to whichever cell comes first.
         """
-        quick = replace(self.generator(model), sampler=replace(self.sampler, steps=1))
+        generator = self.generator(model)
+        quick = replace(generator, sampler=replace(generator.sampler, steps=1, compat=None))
         quick.generate(views_with_depth(inputs), inputs.targets, target_names(inputs), inputs.seed)
 
     def _folder(self, category: str) -> Path:

@@ -15,7 +15,7 @@ from extrap_train.config.benchmark import (
     ScoringConfig,
     TableConfig,
 )
-from extrap_train.config.checks import required_file, validate
+from extrap_train.config.checks import required_file, sampler_for, validate
 from extrap_train.config.commands import DataPrepConfig, TrainConfig
 from extrap_train.config.completion import CompletionConfig, ConfidenceConfig, SplatsConfig
 from extrap_train.config.data import (
@@ -46,6 +46,7 @@ from extrap_train.config.model import (
     ClipConfig,
     ModelConfig,
     SamplerConfig,
+    SamplerOptions,
     UNetConfig,
     VaeConfig,
 )
@@ -86,6 +87,7 @@ __all__ = [
     "QuickConfig",
     "RulesConfig",
     "SamplerConfig",
+    "SamplerOptions",
     "SceneOptions",
     "ScoringConfig",
     "SlurmConfig",
@@ -100,5 +102,6 @@ __all__ = [
     "ValidationConfig",
     "dotted",
     "required_file",
+    "sampler_for",
     "validate",
 ]

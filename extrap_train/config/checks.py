@@ -7,7 +7,13 @@ from typing import Any
 
 from extrap_train.config.commands import DataPrepConfig, TrainConfig
 from extrap_train.config.data import Co3dConfig, PrepConfig
-from extrap_train.config.model import FAMILIES, NEAREST_ALONE, ModelConfig, SamplerConfig
+from extrap_train.config.model import (
+    FAMILIES,
+    NEAREST_ALONE,
+    ModelConfig,
+    SamplerConfig,
+    SamplerOptions,
+)
 from extrap_train.config.training import TrainerConfig
 from extrap_train.config.tree import dotted
 from extrap_train.errors import InputError
@@ -108,6 +114,7 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "validation.pictures": (1, math.inf),
 }
 """Least and greatest value of every number whose range its type does not say."""
+BOUNDS |= {f"model.{name}": BOUNDS[name] for name in BOUNDS if name.startswith("sampler.")}
 
 
 def validate(config: TrainConfig | DataPrepConfig, tasks: tuple[str, ...]) -> None:
@@ -127,7 +134,7 @@ def validate(config: TrainConfig | DataPrepConfig, tasks: tuple[str, ...]) -> No
         _check_model(config.model, config.prep)
         _check_groups(config)
         _check_completion(config)
-        _check_sampler(config.sampler)
+        sampler_for(config.sampler, config.model)
 
 
 def _check_files(config: TrainConfig | DataPrepConfig) -> None:
@@ -226,6 +233,16 @@ def _check_groups(config: TrainConfig) -> None:
         )
 
 
+def sampler_for(options: SamplerOptions, model: ModelConfig) -> SamplerConfig:
+    """How a model's views are sampled: as it recommends, but for what the options say.
+
+    Raises InputError where the two do not go together.
+    """
+    sampler = options.over(model.sampler)
+    _check_sampler(sampler)
+    return sampler
+
+
 def _check_sampler(sampler: SamplerConfig) -> None:
     _check_one_of("sampler.solver", sampler.solver, ("ddim", "dpmpp", "unipc"))
     if sampler.compat is not None:
@@ -233,7 +250,7 @@ def _check_sampler(sampler: SamplerConfig) -> None:
     if sampler.solver != "ddim" and (sampler.eta > 0 or sampler.compat):
         raise InputError(
             f"sampler.solver={sampler.solver} is deterministic and none of the published runs: "
-            "sampler.eta and sampler.compat need sampler.solver=ddim"
+            "sampler.eta and sampler.compat need sampler.solver=ddim; without them, sampler.eta=0"
         )
     interval = sampler.guidance_interval
     if len(interval) != 2 or not 0 <= interval[0] <= interval[1] <= 1:

@@ -7,7 +7,7 @@ from extrap_train.config.data import CategoryConfig, DataConfig, PrepConfig
 from extrap_train.config.depth import DepthConfig
 from extrap_train.config.launcher import LauncherConfig
 from extrap_train.config.matching import MatcherConfig
-from extrap_train.config.model import ModelConfig, SamplerConfig
+from extrap_train.config.model import ModelConfig, SamplerOptions
 from extrap_train.config.scene import SceneOptions
 from extrap_train.config.training import TrainerConfig, ValidationConfig
 from extrap_train.config.tree import MISSING
@@ -23,7 +23,7 @@ class TrainConfig(SceneOptions):
     matcher: MatcherConfig = MISSING
     model: ModelConfig = MISSING
     prep: PrepConfig = field(default_factory=PrepConfig)
-    sampler: SamplerConfig = field(default_factory=SamplerConfig)
+    sampler: SamplerOptions = field(default_factory=SamplerOptions)
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
     validation: ValidationConfig = field(default_factory=ValidationConfig)
     complete: CompletionConfig = field(default_factory=CompletionConfig)

@@ -1,6 +1,6 @@
 """The denoiser with its conditioning, and how views are sampled."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from extrap_train.config.tree import MISSING
 
@@ -46,6 +46,52 @@ class ClipConfig:
 
 
 @dataclass
+class SamplerConfig:
+    """How a view is sampled; the defaults are the small model's."""
+
+    solver: str = "ddim"
+    """`ddim` (paper), or of second order, for few steps: `dpmpp` (DPM-Solver++ 2M), `unipc`."""
+    steps: int = 2
+    """Evaluations of the denoiser."""
+    eta: float = 0.0
+    """Share of DDIM's noise that is drawn anew at every step; 0 is deterministic."""
+    guidance: float = 1.0
+    """Weight of the conditional prediction against the null condition's; 1 is no guidance."""
+    guidance_far: float | None = None
+    """Weight far from the inputs, to which `guidance` grows with the angle; null keeps it."""
+    guidance_far_deg: float = 90.0
+    """Angle between query and nearest reference from which on `guidance_far` holds."""
+    guidance_interval: list[float] = field(default_factory=lambda: [0.0, 1.0])
+    """Shares of the noise schedule, 0 clean to 1 pure noise, between which guidance acts."""
+    guidance_rescale: float = 0.0
+    """How far guidance's wider spread is taken back (Lin et al. 2023); they use 0.7."""
+    compat: str | None = None
+    """`megascenes` samples as ZeroNVS and MegaScenes were published: guidance against plain zeros,
+    which their training never saw, and the noisiest step left out.
+    """
+
+
+@dataclass
+class SamplerOptions:
+    """What a command says of `SamplerConfig`; null leaves it at what the model recommends."""
+
+    solver: str | None = None
+    steps: int | None = None
+    eta: float | None = None
+    guidance: float | None = None
+    guidance_far: float | None = None
+    guidance_far_deg: float | None = None
+    guidance_interval: list[float] | None = None
+    guidance_rescale: float | None = None
+    compat: str | None = None
+
+    def over(self, recommended: SamplerConfig) -> SamplerConfig:
+        """The model's recommendation with what is said here put over it."""
+        said = {name: value for name, value in vars(self).items() if value is not None}
+        return replace(recommended, **said)
+
+
+@dataclass
 class ModelConfig:
     """A denoiser with its conditioning (METHOD: paper II-B)."""
 
@@ -86,6 +132,10 @@ class ModelConfig:
     """What the denoiser says: `epsilon` (the noise), `v_prediction` or `sample` (the latent)."""
     zero_terminal_snr: bool = True
     """The noisiest step is pure noise, as sampling starts from (Lin et al. 2023)."""
+    sampler: SamplerConfig = field(default_factory=SamplerConfig)
+    """How its views are sampled where the command's `sampler` says nothing else; it is saved with
+    the weights.
+    """
     unet: UNetConfig = field(default_factory=UNetConfig)
     learning_rate: float = 3e-4
     """Of AdamW, after the warm-up."""
@@ -108,29 +158,3 @@ class ModelConfig:
     def told_references(self) -> int:
         """`references`, and 1 for the families that are told of no more, whatever it says."""
         return 1 if self.family in NEAREST_ALONE else self.references
-
-
-@dataclass
-class SamplerConfig:
-    """How a view is sampled."""
-
-    solver: str = "ddim"
-    """`ddim` (paper), or of second order, for few steps: `dpmpp` (DPM-Solver++ 2M), `unipc`."""
-    steps: int = 2
-    """Evaluations of the denoiser."""
-    eta: float = 0.0
-    """Share of DDIM's noise that is drawn anew at every step; 0 is deterministic."""
-    guidance: float = 1.0
-    """Weight of the conditional prediction against the null condition's; 1 is no guidance."""
-    guidance_far: float | None = None
-    """Weight far from the inputs, to which `guidance` grows with the angle; null keeps it."""
-    guidance_far_deg: float = 90.0
-    """Angle between query and nearest reference from which on `guidance_far` holds."""
-    guidance_interval: list[float] = field(default_factory=lambda: [0.0, 1.0])
-    """Shares of the noise schedule, 0 clean to 1 pure noise, between which guidance acts."""
-    guidance_rescale: float = 0.0
-    """How far guidance's wider spread is taken back (Lin et al. 2023); they use 0.7."""
-    compat: str | None = None
-    """`megascenes` samples as ZeroNVS and MegaScenes were published: guidance against plain zeros,
-    which their training never saw, and the noisiest step left out.
-    """

@@ -12,7 +12,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from extrap_train.config import ClipConfig, ModelConfig, UNetConfig, VaeConfig
+from extrap_train.config import ClipConfig, ModelConfig, SamplerConfig, UNetConfig, VaeConfig
 from extrap_train.data.files import partial_beside, write_whole
 from extrap_train.diffusion.autoencoder import PixelPatches
 from extrap_train.diffusion.compact import compress, restore
@@ -143,7 +143,7 @@ def load_model(folder: Path) -> ExtrapolationModel:
 
 
 def _saved_config(folder: Path) -> ModelConfig:
-    inner = {"unet": UNetConfig, "vae": VaeConfig, "clip": ClipConfig}
+    inner = {"unet": UNetConfig, "vae": VaeConfig, "clip": ClipConfig, "sampler": SamplerConfig}
     try:
         saved = json.loads((folder / MODEL_CONFIG).read_text())
         for name, kind in inner.items():

@@ -9,7 +9,7 @@ import torch
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 
-from extrap_train.config import TrainConfig, TrainerConfig
+from extrap_train.config import TrainConfig, TrainerConfig, sampler_for
 from extrap_train.diffusion.evaluation import (
     Prediction,
     better_than_baselines,
@@ -40,6 +40,7 @@ class CategoryTraining(lightning.LightningModule):
         super().__init__()
         self.model = model
         self.config = config
+        self.sampler = sampler_for(config.sampler, model.config)
         self.validation_names = validation_names
         self.distance = lpips
         self.predictions: list[Prediction] = []
@@ -66,7 +67,7 @@ class CategoryTraining(lightning.LightningModule):
     def validation_step(self, batch: PairBatch, batch_idx: int) -> None:
         """Sample the batch's queries."""
         named = [(batch, self.validation_names[batch_idx])]
-        self.predictions += predict(self.model, named, self.config.sampler, self.config.seed)
+        self.predictions += predict(self.model, named, self.sampler, self.config.seed)
 
     def on_validation_epoch_start(self) -> None:
         """Forget the last validation's pictures."""

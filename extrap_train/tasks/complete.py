@@ -22,6 +22,7 @@ from extrap_train.config import (
     SyntheticConfig,
     TrainConfig,
     dotted,
+    sampler_for,
 )
 from extrap_train.data.files import write_whole
 from extrap_train.data.photographs import CATEGORY
@@ -161,7 +162,7 @@ def _workshop(job: _Job) -> Workshop:
         )
     model = trained_model(config)
     model = model.to("cuda" if torch.cuda.is_available() else "cpu")
-    generator = DiffusionGenerator(model, config.sampler)
+    generator = DiffusionGenerator(model, sampler_for(config.sampler, model.config))
     # A generated view brings no depth along.
     own = config.depth
     source = StereoConfig() if isinstance(own, DatasetDepthConfig) else own
@@ -173,7 +174,7 @@ def _started_map(job: _Job, workshop: Workshop, console: Console) -> GlobalMap:
     folder = job.folder / "map"
     if not job.config.resume:
         shutil.rmtree(folder, ignore_errors=True)
-    _check_same(folder / "options.json", _identity(job))
+    _check_same(folder / "options.json", _identity(job, workshop))
     known = load_map(folder, job.config.complete.tolerance)
     if len(known) >= len(job.inputs):
         console.print(f"{folder}: {len(known)} views are there already")
@@ -189,7 +190,7 @@ def _started_map(job: _Job, workshop: Workshop, console: Console) -> GlobalMap:
     return known
 
 
-def _identity(job: _Job) -> dict[str, Any]:
+def _identity(job: _Job, workshop: Workshop) -> dict[str, Any]:
     """The options that a map depends on."""
     config = job.config
     complete_options = {
@@ -198,13 +199,16 @@ def _identity(job: _Job) -> dict[str, Any]:
         if not f"{key}.".startswith(tuple(f"{name}." for name in _NOT_PART_OF_THE_MAP))
     }
     exact = config.complete.generator == "exact"
+    sampler = sampler_for(config.sampler, config.model)
+    if isinstance(workshop.generator, DiffusionGenerator):
+        sampler = workshop.generator.sampler
     return {
         "scene": config.scene,
         "data.seed": getattr(config.data, "seed", None),
         "inputs": [job.sequence.frames[i].name for i in job.inputs],
         "depth": asdict(config.depth),
         **complete_options,
-        "sampler": asdict(config.sampler),
+        "sampler": asdict(sampler),
         "weights": None if exact else config.weights or str(newest_run(config).model.resolve()),
         "adapter": config.adapter,
         "seed": config.seed,

@@ -20,7 +20,8 @@ from extrap_train.tasks.training_data import data_module, prepared_data, validat
 def measure(model: ExtrapolationModel, steps: int, config: TrainConfig, folder: RunFolder) -> None:
     """Write metrics, pictures and `summary.json` of a model that was trained for `steps`.
 
-    Views are sampled as `config.sampler` says, and in the model's own groups.
+    Views are sampled as the model recommends, but for what `config.sampler` says, and in the
+    model's own groups.
     """
     quieten_lightning()
     distance, missing = lpips_or_reason(config.validation.lpips_weights)

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from data_prep.views import target_views
-from extrap_train.config import TrainConfig
+from extrap_train.config import SamplerConfig, TrainConfig, sampler_for
 from extrap_train.data.files import write_whole
 from extrap_train.data.module import spread
 from extrap_train.data.scene_pairs import ScenePairs
@@ -45,7 +45,8 @@ def run(config: TrainConfig) -> Path:
     inputs = open_inputs(config, model.config.warp_size)
     pairs = ScenePairs(inputs.views, model.config.told_references)
     folder = Path(config.output) / "scene" / inputs.label
-    asked = _asked(config, inputs)
+    sampler = sampler_for(config.sampler, model.config)
+    asked = _asked(config, inputs, sampler)
     if config.resume and _is_done(folder, asked):
         console.print(f"already adapted with these options: {folder}")
         return folder
@@ -63,7 +64,7 @@ def run(config: TrainConfig) -> Path:
             adapter,
             pairs,
             config.lora,
-            config.sampler,
+            sampler,
             seconds=60 * config.minutes,
             seed=config.seed,
             fabric=fabric,
@@ -78,14 +79,14 @@ def run(config: TrainConfig) -> Path:
     return folder
 
 
-def _asked(config: TrainConfig, inputs: SceneInputs) -> dict[str, Any]:
+def _asked(config: TrainConfig, inputs: SceneInputs, sampler: SamplerConfig) -> dict[str, Any]:
     return {
         "scene": config.scene,
         "inputs": [view.name for view in inputs.views],
         "weights": config.weights,
         "depth": asdict(config.depth),
         "lora": asdict(config.lora),
-        "sampler": asdict(config.sampler),
+        "sampler": asdict(sampler),
         "minutes": config.minutes,
         "seed": config.seed,
     }
@@ -112,7 +113,7 @@ def _generate(
         return None
     cameras = stack_cameras([view.camera for view in targets])
     with fabric.autocast():
-        generator = DiffusionGenerator(model, config.sampler)
+        generator = DiffusionGenerator(model, sampler_for(config.sampler, model.config))
         names = [view.name for view in targets]
         return generator.generate(inputs.views, cameras, names, config.seed)
 

@@ -5,7 +5,7 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
-from extrap_train.config import TrainConfig
+from extrap_train.config import TrainConfig, sampler_for
 from extrap_train.diffusion.checkpoint import load_model
 from extrap_train.runs import RunFolder, existing_run
 from extrap_train.tasks.measure import measure
@@ -14,9 +14,11 @@ from extrap_train.tasks.measure import measure
 def run(config: TrainConfig) -> Path:
     """Sample the held-out views with the run's model and leave the scores beside the run's own."""
     trained = existing_run(config)
+    model = load_model(trained.model)
     steps = int(json.loads(trained.summary.read_text())["steps"])
-    how = {"sampler": asdict(config.sampler), "validation": asdict(config.validation)}
+    sampler = sampler_for(config.sampler, model.config)
+    how = {"sampler": asdict(sampler), "validation": asdict(config.validation)}
     digest = hashlib.sha256(json.dumps(how, sort_keys=True).encode()).hexdigest()[:8]
     folder = RunFolder(trained.path / "validations" / f"seed{config.seed}-{digest}")
-    measure(load_model(trained.model), steps, config, folder)
+    measure(model, steps, config, folder)
     return folder.path

@@ -13,7 +13,13 @@ from rich.console import Console
 
 from data_prep.frames import object_square
 from data_prep.views import choose_frames, input_views
-from extrap_train.config import DatasetDepthConfig, DepthConfig, SamplerConfig, TrainConfig
+from extrap_train.config import (
+    DatasetDepthConfig,
+    DepthConfig,
+    SamplerConfig,
+    TrainConfig,
+    sampler_for,
+)
 from extrap_train.data.posed import read_cameras
 from extrap_train.data.scene import open_scene
 from extrap_train.depth.build import depth_source
@@ -44,7 +50,7 @@ def run(config: TrainConfig) -> None:
     inputs = open_inputs(config, model.config.warp_size)
     names, cameras, truth = _queries(config, inputs, model.config.image_size)
     with fabric.autocast():
-        generator = DiffusionGenerator(model, config.sampler)
+        generator = DiffusionGenerator(model, sampler_for(config.sampler, model.config))
         made = generator.generate(inputs.views, cameras, names, config.seed)
     folder = Path(config.output) / "view" / inputs.label
     _write(made, inputs.views, names, folder, walk=config.orbit is not None)
@@ -58,8 +64,11 @@ def run(config: TrainConfig) -> None:
 def open_generator(
     weights: str, adapter: str | None = None, sampler: SamplerConfig | None = None
 ) -> DiffusionGenerator:
-    """The generator of a model folder, or of `base`, the packaged model."""
-    return DiffusionGenerator(open_model(weights, adapter), sampler or SamplerConfig())
+    """The generator of a model folder, or of a packaged model; without `sampler` it samples as the
+    model recommends.
+    """
+    model = open_model(weights, adapter)
+    return DiffusionGenerator(model, sampler or model.config.sampler)
 
 
 def open_views(
