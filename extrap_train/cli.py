@@ -73,6 +73,7 @@ def command(name: str, run: Callable[[Any], Path | None]) -> None:
     def composed(config: DictConfig) -> Path | None:
         try:
             typed = typed_config(config)
+            _check_processes(typed)
             _use_threads(getattr(typed, "threads", None))
             return run(typed)
         except InputError as error:
@@ -115,6 +116,16 @@ def typed_config(config: DictConfig) -> Any:
     typed: Any = OmegaConf.to_object(config)
     schema.validate(typed, TASKS)
     return typed
+
+
+def _check_processes(config: Any) -> None:
+    """Lightning starts a run's other processes with the whole command: that is the whole sweep."""
+    devices = config.trainer.devices if isinstance(config, schema.TrainConfig) else 1
+    if devices > 1 and HydraConfig.get().mode == RunMode.MULTIRUN:
+        raise InputError(
+            f"trainer.devices={devices}: a job of a sweep trains on one device; leave it out or "
+            "start the runs one by one"
+        )
 
 
 def _check(name: str, arguments: list[str]) -> None:

@@ -100,24 +100,28 @@ def _digest(identity: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(named, sort_keys=True).encode()).hexdigest()
 
 
+def run_folder(config: TrainConfig) -> RunFolder:
+    """Where the run lies or will lie; raises InputError where no folder may be called so."""
+    name = config.run or f"seed{config.seed}-{_digest(run_identity(config))[:8]}"
+    if name == _LATEST or Path(name).name != name:
+        raise InputError(f"run={name}: must be the name of a folder, other than {_LATEST}")
+    return RunFolder(_runs_of(config) / name)
+
+
 def open_run(config: TrainConfig) -> RunFolder:
-    """Make or find the run's folder and write its configuration.
+    """Make or find the run's folder and write its configuration; for one process alone.
 
     With `resume=false` what an earlier run of that name left is removed first. Raises InputError
     where a run of that name was started with other options and is to be resumed.
     """
-    identity = run_identity(config)
-    name = config.run or f"seed{config.seed}-{_digest(identity)[:8]}"
-    if name == _LATEST or Path(name).name != name:
-        raise InputError(f"run={name}: must be the name of a folder, other than {_LATEST}")
-    path = _runs_of(config) / name
-    saved = path / "config.yaml"
+    folder = run_folder(config)
+    saved = folder.path / "config.yaml"
     if saved.is_file() and config.resume:
-        _check_same(saved, identity, config)
+        _check_same(saved, run_identity(config), config)
     if not config.resume:
-        _start_over(path)
+        _start_over(folder)
     write_whole(saved, yaml.safe_dump(_said(config), sort_keys=False).encode())
-    return RunFolder(path)
+    return folder
 
 
 def existing_run(config: TrainConfig) -> RunFolder:
@@ -137,13 +141,12 @@ def _runs_of(config: TrainConfig) -> Path:
     return Path(config.output) / "train" / config.category.name / config.model.name
 
 
-def _start_over(path: Path) -> None:
+def _start_over(folder: RunFolder) -> None:
     """Remove what would make a later command resume the old run, or take it for finished."""
-    folder = RunFolder(path)
     folder.summary.unlink(missing_ok=True)
     shutil.rmtree(folder.checkpoints, ignore_errors=True)
     shutil.rmtree(folder.averages, ignore_errors=True)
-    (path / "metrics.csv").unlink(missing_ok=True)
+    (folder.path / "metrics.csv").unlink(missing_ok=True)
 
 
 def _check_same(saved: Path, identity: dict[str, Any], config: TrainConfig) -> None:

@@ -21,6 +21,7 @@ _RANK = {
     "extrap_train.data": 3,
     "extrap_train.metrics": 3,
     "extrap_train.pictures": 4,
+    "extrap_train.processes": 4,
     "extrap_train.diffusion": 5,
     "extrap_train.runs": 5,
     "extrap_train.sweep": 5,

@@ -166,15 +166,16 @@ class PairModule(lightning.LightningDataModule):
         return self._loader(dataset, sampler)
 
     def val_dataloader(self) -> DataLoader[PairBatch]:
-        """Held-out examples, spread evenly over the test pairs."""
-        return self._loader(
-            ValidationBatches(
-                self.validation, self.chosen, self.validation_batch_size, self.references
-            )
+        """Held-out examples, spread evenly over the test pairs; processes take turns at them."""
+        dataset = ValidationBatches(
+            self.validation, self.chosen, self.validation_batch_size, self.references
         )
+        trainer = self.trainer
+        rank, world = (trainer.global_rank, trainer.world_size) if trainer else (0, 1)
+        return self._loader(dataset, shared_out(len(dataset.batches), rank, world))
 
     def _loader(
-        self, dataset: Dataset[PairBatch], sampler: Sampler[Positions] | None = None
+        self, dataset: Dataset[PairBatch], sampler: Sampler[Positions] | list[int]
     ) -> DataLoader[PairBatch]:
         return DataLoader(
             dataset,
@@ -187,6 +188,13 @@ class PairModule(lightning.LightningDataModule):
     def on_after_batch_transfer(self, batch: PairBatch, dataloader_idx: int) -> PairBatch:
         """Lightning's hook: warps are computed, not stored."""
         return with_warp(batch, self.image_size)
+
+
+def shared_out(batches: int, rank: int, world: int) -> list[int]:
+    """Indices of the batches that fall to a process; to one too many the last batch once more:
+    Lightning runs no validation, and no exchange at its end, in a process without a batch.
+    """
+    return list(range(rank, batches, world)) or [batches - 1]
 
 
 def spread(available: int, wanted: int) -> list[int]:

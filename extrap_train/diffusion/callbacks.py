@@ -16,6 +16,7 @@ from lightning import LightningModule, Trainer
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch.callbacks import Callback, WeightAveraging
 from lightning.pytorch.loggers import Logger
+from lightning.pytorch.utilities import rank_zero_only
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -157,8 +158,9 @@ class MetricsTable(Logger):
         else:
             self._rows.append({"step": str(step), **row})
 
+    @rank_zero_only
     def save(self) -> None:
-        """Write the table whole."""
+        """Write the table whole; Lightning asks every process, and the first one has the rows."""
         columns = list(dict.fromkeys(name for row in self._rows for name in row))
         text = io.StringIO()
         writer = csv.DictWriter(text, columns, restval="")

@@ -1,6 +1,6 @@
 """Scores of a model and of the baselines on the same held-out examples."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import pandas as pd
@@ -9,7 +9,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrap_train.config import SamplerConfig
-from extrap_train.data.module import spread
 from extrap_train.diffusion.baselines import inpainted_warp, mean_filled_warp, nearest_reference
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sample_views, view_generator
@@ -106,16 +105,18 @@ def better_than_baselines(summary: dict[str, dict[str, float]]) -> float:
     return summary["model"]["psnr"] - max(others)
 
 
-def first_views(predictions: list[Prediction], count: int) -> Prediction:
-    """`count` views spread evenly over the predictions, as one, for pictures."""
-    total = sum(len(p.names) for p in predictions)
-    chosen = torch.tensor(spread(total, count))
-    names = [name for p in predictions for name in p.names]
+def views_named(predictions: list[Prediction], names: list[str]) -> Prediction:
+    """Those of the views that are there, in this order and once each, as one on the CPU."""
+    there = [name for p in predictions for name in p.names]
+    found = [name for name in names if name in there]
+    chosen = torch.tensor([there.index(name) for name in found], dtype=torch.long)
+
+    def taken(tensors: Sequence[Tensor]) -> Tensor:
+        whole = torch.cat(list(tensors))
+        return whole[chosen.to(whole.device)].cpu()
+
     return Prediction(
-        combine([p.batch for p in predictions], lambda tensors: torch.cat(list(tensors))[chosen]),
-        [names[i] for i in chosen.tolist()],
-        {
-            method: torch.cat([p.images[method] for p in predictions])[chosen]
-            for method in predictions[0].images
-        },
+        combine([p.batch for p in predictions], taken),
+        found,
+        {m: taken([p.images[m] for p in predictions]) for m in predictions[0].images},
     )

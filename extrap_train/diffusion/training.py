@@ -10,17 +10,19 @@ from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 
 from extrap_train.config import TrainConfig, TrainerConfig, sampler_for
+from extrap_train.data.module import shared_out, spread
 from extrap_train.diffusion.evaluation import (
     Prediction,
     better_than_baselines,
-    first_views,
     predict,
     score,
     summarise,
+    views_named,
 )
 from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.metrics import Distance
+from extrap_train.processes import gathered
 from extrap_train.views import PairBatch
 
 _STEPS_A_ROW = 20
@@ -43,7 +45,8 @@ class CategoryTraining(lightning.LightningModule):
         self.sampler = sampler_for(config.sampler, model.config)
         self.validation_names = validation_names
         self.distance = lpips
-        self.predictions: list[Prediction] = []
+        self.predictions: dict[int, Prediction] = {}
+        self.tables: dict[int, pd.DataFrame] = {}
         self.validated_step = -1
         self.validation_seconds = 0.0
 
@@ -56,7 +59,7 @@ class CategoryTraining(lightning.LightningModule):
         loss = diffusion_loss(
             self.model, batch, generator, options.condition_dropout, options.min_snr
         )
-        self.log("loss", loss, logger=False)
+        self.log("loss", loss, logger=False, sync_dist=True)
         return loss
 
     def on_train_batch_end(self, outputs: object, batch: PairBatch, batch_idx: int) -> None:
@@ -66,18 +69,27 @@ class CategoryTraining(lightning.LightningModule):
 
     def validation_step(self, batch: PairBatch, batch_idx: int) -> None:
         """Sample the batch's queries."""
-        named = [(batch, self.validation_names[batch_idx])]
-        self.predictions += predict(self.model, named, self.sampler, self.config.seed)
+        of_all = len(self.validation_names)
+        index = shared_out(of_all, self.global_rank, self.trainer.world_size)[batch_idx]
+        named = [(batch, self.validation_names[index])]
+        self.predictions[index] = next(predict(self.model, named, self.sampler, self.config.seed))
 
     def on_validation_epoch_start(self) -> None:
         """Forget the last validation's pictures."""
-        self.predictions = []
+        self.predictions = {}
         self._validation_started = time.perf_counter()
 
     def on_validation_epoch_end(self) -> None:
-        """Log the means, and remember which step they are of."""
+        """Bring all processes' views together, log the means, and remember the step."""
         self.validated_step = self.global_step
         self.validation_seconds = time.perf_counter() - self._validation_started
+        own = {index: score(made, self.distance) for index, made in self.predictions.items()}
+        self.tables = {index: table for tables in gathered(own) for index, table in tables.items()}
+        names = [name for batch in self.validation_names for name in batch]
+        shown = [names[i] for i in spread(len(names), self.config.validation.pictures)]
+        self._shown = views_named(
+            gathered(views_named(list(self.predictions.values()), shown)), shown
+        )
         summary = summarise(self.scores())
         metrics = {f"validation/{name}": value for name, value in summary["model"].items()}
         metrics["validation/above_baselines_db"] = better_than_baselines(summary)
@@ -92,11 +104,11 @@ class CategoryTraining(lightning.LightningModule):
 
     def scores(self) -> pd.DataFrame:
         """Scores of the last validation, a row per view and method."""
-        return pd.concat([score(p, self.distance) for p in self.predictions], ignore_index=True)
+        return pd.concat([self.tables[i] for i in sorted(self.tables)], ignore_index=True)
 
     def pictures(self) -> Prediction:
-        """The views of the last validation that are shown."""
-        return first_views(self.predictions, self.config.validation.pictures)
+        """Views of the last validation, spread evenly over them, to be shown."""
+        return self._shown
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         """AdamW with a linear warm-up, as MegaScenes trains, and a late inverse-root decay."""

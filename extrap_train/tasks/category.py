@@ -1,8 +1,11 @@
 """`task=category`, the main job: data, training and validation of a category model."""
 
 import logging
+import signal
 import time
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
@@ -28,37 +31,55 @@ from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.errors import InputError
 from extrap_train.metrics import Distance, lpips_or_reason
-from extrap_train.runs import RunFolder, open_run, point_latest, provenance
+from extrap_train.processes import Opening, announce, is_first, join
+from extrap_train.runs import RunFolder, open_run, point_latest, provenance, run_folder
 from extrap_train.tasks.results import Results, draw_curve, draw_views, is_finished, write_results
 from extrap_train.tasks.training_data import data_module, prepared_data, validation_names
 
 
 def run(config: TrainConfig) -> Path:
     """Train a category model and leave weights, metrics, pictures and `summary.json` behind."""
-    console = Console()
+    console = Console(quiet=not is_first())
     quieten_lightning()
     distance, missing = lpips_or_reason(config.validation.lpips_weights)
     model = _model(config)
     if (needed := training_memory(model, config.trainer)).is_worth_a_word:
         console.print(f"{needed}")
-    folder = open_run(config)
+    folder = run_folder(config)
+    with _opened(folder, config) as opening:
+        if opening.is_finished:
+            console.print(f"already trained for {config.trainer.steps} steps: {folder.path}")
+        else:
+            _train(config, folder, opening.checkpoint, model, distance, missing, console)
+    return folder.path
+
+
+@contextmanager
+def _opened(folder: RunFolder, config: TrainConfig) -> Iterator[Opening]:
+    """The run, closed to other commands; the first process opens it, the others follow."""
+    if not is_first():
+        yield join(folder.path)
+        return
     try:
         with FileLock(folder.path / ".lock", timeout=0):
-            if config.resume and is_finished(folder, config):
+            open_run(config)
+            is_over = config.resume and is_finished(folder, config)
+            if is_over:
                 point_latest(folder)
-                console.print(f"already trained for {config.trainer.steps} steps: {folder.path}")
-            else:
-                _train(config, folder, model, distance, missing, console)
+            newest = checkpoints(folder.checkpoints)[-1:]
+            opening = Opening(is_over, str(newest[0]) if newest else None)
+            announce(folder.path, opening)
+            yield opening
     except Timeout:
         raise InputError(
             f"{folder.path}: another process is training this run; wait for it or give run=NAME"
         ) from None
-    return folder.path
 
 
 def _train(
     config: TrainConfig,
     folder: RunFolder,
+    checkpoint: str | None,
     model: ExtrapolationModel,
     distance: Distance | None,
     missing: dict[str, str],
@@ -66,14 +87,15 @@ def _train(
 ) -> None:
     started = time.perf_counter()
     prepared = prepared_data(config)
-    point_latest(folder)
+    if is_first():
+        point_latest(folder)
     seconds = {"prepare": time.perf_counter() - started}
     data = data_module(config, prepared)
     training = CategoryTraining(model, config, validation_names(data), distance)
     started = time.perf_counter()
-    trainer = _trainer(config, folder)
-    with advice_where_memory_ends(config.trainer):
-        trainer.fit(training, data, ckpt_path=_newest(folder), weights_only=True)
+    trainer = _trainer(config, folder, checkpoint)
+    with advice_where_memory_ends(config.trainer), _ended_together(trainer):
+        trainer.fit(training, data, ckpt_path=checkpoint, weights_only=True)
     seconds["train"] = time.perf_counter() - started
     if training.validated_step != trainer.global_step:
         trainer.validate(training, data, verbose=False)
@@ -113,9 +135,15 @@ def _model(config: TrainConfig) -> ExtrapolationModel:
     return model
 
 
-def _newest(folder: RunFolder) -> str | None:
-    saved = checkpoints(folder.checkpoints)
-    return str(saved[-1]) if saved else None
+@contextmanager
+def _ended_together(trainer: lightning.Trainer) -> Iterator[None]:
+    """An error ends the processes that Lightning has started, which would wait for this one."""
+    try:
+        yield
+    except BaseException:
+        if (launcher := trainer.strategy.launcher) is not None:
+            cast(Any, launcher).kill(signal.SIGKILL)
+        raise
 
 
 class _Pictures(lightning.Callback):
@@ -124,7 +152,7 @@ class _Pictures(lightning.Callback):
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
-    def on_validation_epoch_end(
+    def on_validation_end(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
     ) -> None:
         assert isinstance(pl_module, CategoryTraining)
@@ -132,10 +160,9 @@ class _Pictures(lightning.Callback):
             draw_views(pl_module.pictures(), self.folder / f"step-{trainer.global_step:08d}.png")
 
 
-def _trainer(config: TrainConfig, folder: RunFolder) -> lightning.Trainer:
+def _trainer(config: TrainConfig, folder: RunFolder, checkpoint: str | None) -> lightning.Trainer:
     options = config.trainer
-    newest = _newest(folder)
-    resumed_step = int(Path(newest).stem.split("-")[1]) if newest else 0
+    resumed_step = int(Path(checkpoint).stem.split("-")[1]) if checkpoint else 0
     epoch = min(options.checkpoint_every, options.steps)
     return lightning.Trainer(
         accelerator=options.accelerator,

@@ -1,0 +1,95 @@
+"""Several processes that train one model, each on its own device: the first opens the run, the
+others join it.
+"""
+
+import json
+import os
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch.distributed as dist
+from lightning.pytorch.utilities import rank_zero_only
+
+from extrap_train.data.files import write_whole
+from extrap_train.errors import InputError
+
+T = TypeVar("T")
+
+_LAUNCHES = (
+    "SLURM_JOB_ID",
+    "SLURM_STEP_ID",
+    "SLURM_RESTART_COUNT",
+    "TORCHELASTIC_RUN_ID",
+    "TORCHELASTIC_RESTART_COUNT",
+)
+"""What tells one launch of all processes from another where Lightning does not start them itself.
+Those that it starts find the word of the first, which starts them after it has given it.
+"""
+_WAIT_S = 300.0
+_LOOK_EVERY_S = 0.1
+
+
+@dataclass(frozen=True)
+class Opening:
+    """What the first process found when it opened the run, and all of them go by."""
+
+    is_finished: bool
+    checkpoint: str | None
+    """Path of the checkpoint to resume from."""
+
+
+def is_first() -> bool:
+    """Whether this process is the only one or the one that opens, saves and speaks for all.
+
+    Known before the processes have met, from the launcher's variables, as Lightning reads them.
+    """
+    return rank_zero_only.rank == 0
+
+
+def announce(folder: Path, opening: Opening) -> None:
+    """Tell the other processes of this launch that the run is open."""
+    content = {"launch": _launch(), "opening": asdict(opening)}
+    write_whole(_word(folder), json.dumps(content).encode())
+
+
+def join(folder: Path, wait_s: float = _WAIT_S) -> Opening:
+    """What the first process of this launch has found; waits until it has.
+
+    Raises InputError where it has not within `wait_s`.
+    """
+    ends = time.monotonic() + wait_s
+    while (opening := _announced(folder)) is None:
+        if time.monotonic() >= ends:
+            raise InputError(
+                f"{folder}: has not been opened by the first process of this launch in "
+                f"{wait_s:.0f} s; see what that one says"
+            )
+        time.sleep(_LOOK_EVERY_S)
+    return opening
+
+
+def gathered(value: T) -> list[T]:
+    """Every process's value, in the order of their ranks; tensors must be on the CPU."""
+    if not (dist.is_available() and dist.is_initialized()):
+        return [value]
+    values: list[Any] = [None] * dist.get_world_size()
+    dist.all_gather_object(values, value)
+    return values
+
+
+def _announced(folder: Path) -> Opening | None:
+    try:
+        content = json.loads(_word(folder).read_text())
+    except FileNotFoundError:
+        return None
+    return Opening(**content["opening"]) if content["launch"] == _launch() else None
+
+
+def _word(folder: Path) -> Path:
+    return folder / ".opened.json"
+
+
+def _launch() -> dict[str, str]:
+    return {name: os.environ[name] for name in _LAUNCHES if name in os.environ}
