@@ -12,7 +12,7 @@ from typing import Any
 import torch
 import yaml
 
-from extrap_train.config import SceneOptions, SyntheticConfig, TrainConfig, dotted, sampler_for
+from extrap_train.config import SceneOptions, SyntheticConfig, TrainConfig, dotted
 from extrap_train.data.files import partial_beside, write_whole
 from extrap_train.errors import InputError
 
@@ -92,7 +92,7 @@ def run_identity(config: TrainConfig) -> dict[str, Any]:
 
 def _said(config: TrainConfig) -> dict[str, Any]:
     """All options, with the sampler as it is used: what the model recommends is spelled out."""
-    return asdict(config) | {"sampler": asdict(sampler_for(config.sampler, config.model))}
+    return asdict(config) | {"sampler": asdict(config.sampler.over(config.model.sampler))}
 
 
 def _digest(identity: dict[str, Any]) -> str:

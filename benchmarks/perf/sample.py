@@ -23,6 +23,7 @@ from benchmarks.perf.timing import Row, compare
 from extrap_train.config import SamplerConfig
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sample_views, view_generator
+from extrap_train.diffusion.schedule import solver_of
 from extrap_train.views import PairBatch
 
 _GUIDANCE = 3.0
@@ -85,12 +86,12 @@ def plain_sampling(model: ExtrapolationModel, batch: PairBatch, steps: int) -> S
             for i in range(len(batch.image))
         ]
         latent = torch.stack(draws).to(condition.base)
-        model.schedule.set_timesteps(steps)
-        for timestep in model.schedule.timesteps:
+        solver = solver_of(model.schedule, SamplerConfig(steps=steps))
+        for timestep in solver.timesteps:
             times = torch.full((len(latent),), int(timestep), device=latent.device)
             conditional, without = model(latent, times, condition), model(latent, times, null)
             prediction = without + _GUIDANCE * (conditional - without)
-            latent = model.schedule.step(prediction, timestep, latent).prev_sample
+            latent = solver.step(prediction, timestep, latent, 0.0, None)
         return model.decode_target(latent, condition)
 
     return sample

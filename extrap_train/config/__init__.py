@@ -15,7 +15,7 @@ from extrap_train.config.benchmark import (
     ScoringConfig,
     TableConfig,
 )
-from extrap_train.config.checks import required_file, sampler_for, validate
+from extrap_train.config.checks import require_published, required_file, sampler_for, validate
 from extrap_train.config.commands import DataPrepConfig, TrainConfig
 from extrap_train.config.completion import CompletionConfig, ConfidenceConfig, SplatsConfig
 from extrap_train.config.data import (
@@ -101,6 +101,7 @@ __all__ = [
     "VaeConfig",
     "ValidationConfig",
     "dotted",
+    "require_published",
     "required_file",
     "sampler_for",
     "validate",

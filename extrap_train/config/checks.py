@@ -21,6 +21,9 @@ from extrap_train.errors import InputError
 _ACCELERATORS = ("auto", "cpu", "gpu", "cuda", "mps")
 _PRECISIONS = ("32-true", "bf16-mixed", "16-mixed", "bf16-true", "16-true", "64-true")
 
+_PUBLISHED_STEPS = tuple(n for n in range(2, 501) if 1000 % n == 0)
+"""Strides that go into the 1000 steps of the schedule without a rest."""
+
 BOUNDS: dict[str, tuple[float, float]] = {
     "seed": (0, 2**30),
     "threads": (1, math.inf),
@@ -134,7 +137,7 @@ def validate(config: TrainConfig | DataPrepConfig, tasks: tuple[str, ...]) -> No
         _check_model(config.model, config.prep)
         _check_groups(config)
         _check_completion(config)
-        sampler_for(config.sampler, config.model)
+        _check_sampler_of(config)
 
 
 def _check_files(config: TrainConfig | DataPrepConfig) -> None:
@@ -233,6 +236,14 @@ def _check_groups(config: TrainConfig) -> None:
         )
 
 
+def _check_sampler_of(config: TrainConfig) -> None:
+    """What other weights than the configured model's recommend is known when they are read."""
+    if config.weights is None:
+        sampler_for(config.sampler, config.model)
+    else:
+        _check_sampler(config.sampler.over(SamplerConfig()))
+
+
 def sampler_for(options: SamplerOptions, model: ModelConfig) -> SamplerConfig:
     """How a model's views are sampled: as it recommends, but for what the options say.
 
@@ -240,7 +251,26 @@ def sampler_for(options: SamplerOptions, model: ModelConfig) -> SamplerConfig:
     """
     sampler = options.over(model.sampler)
     _check_sampler(sampler)
+    if sampler.compat is not None:
+        require_published(sampler, model.prediction, zero_terminal_snr=model.zero_terminal_snr)
     return sampler
+
+
+def require_published(sampler: SamplerConfig, prediction: str, *, zero_terminal_snr: bool) -> None:
+    """InputError where sampling as ZeroNVS and MegaScenes did (`compat`) says nothing of a model,
+    or of a number of steps that they could not take.
+    """
+    option = f"sampler.compat={sampler.compat}"
+    if prediction != "epsilon" or zero_terminal_snr:
+        raise InputError(
+            f"{option} samples as models were published that predict the noise, without zero "
+            f"terminal SNR; this one predicts `{prediction}`: leave it out"
+        )
+    if sampler.steps not in _PUBLISHED_STEPS:
+        raise InputError(
+            f"{option} with sampler.steps={sampler.steps}: the published spacing needs one of "
+            f"{', '.join(map(str, _PUBLISHED_STEPS))}, of which it leaves out the noisiest"
+        )
 
 
 def _check_sampler(sampler: SamplerConfig) -> None:

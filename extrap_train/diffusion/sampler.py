@@ -12,7 +12,7 @@ from torch import Tensor
 from extrap_train.config import SamplerConfig
 from extrap_train.diffusion.conditioning import Conditioning
 from extrap_train.diffusion.guidance import acts, guidance_weights, guided
-from extrap_train.diffusion.schedule import solver_of
+from extrap_train.diffusion.schedule import SpacedDdim, solver_of
 from extrap_train.views import PairBatch
 
 
@@ -64,9 +64,9 @@ def sample_views(
     conditioning = model.condition(batch)
     weights = guidance_weights(batch, config)
     solver = solver_of(model.schedule, config)
-    levels = solver.config["num_train_timesteps"] - 1
+    levels = model.schedule.config["num_train_timesteps"] - 1
     latent = _noise(conditioning.base, generators)
-    for timestep in solver.timesteps[1:] if config.compat == "megascenes" else solver.timesteps:
+    for timestep in solver.timesteps:
         steps = torch.full((len(latent),), int(timestep), device=latent.device)
         if acts(int(timestep) / levels, config) and not (weights == 1).all():
             prediction = _guided(model, latent, steps, conditioning, weights, config)
@@ -84,10 +84,10 @@ def _stepped(
     eta: float,
     generators: Sequence[torch.Generator],
 ) -> Float[Tensor, "b z h w"]:
-    if not isinstance(solver, DDIMScheduler):
+    if not isinstance(solver, SpacedDdim):
         return solver.step(prediction, timestep, latent).prev_sample
     noise = _noise(latent, generators) if eta > 0 else None
-    return solver.step(prediction, timestep, latent, eta=eta, variance_noise=noise).prev_sample
+    return solver.step(prediction, timestep, latent, eta, noise)
 
 
 def _noise(

@@ -199,7 +199,7 @@ def _identity(job: _Job, workshop: Workshop) -> dict[str, Any]:
         if not f"{key}.".startswith(tuple(f"{name}." for name in _NOT_PART_OF_THE_MAP))
     }
     exact = config.complete.generator == "exact"
-    sampler = sampler_for(config.sampler, config.model)
+    sampler = config.sampler.over(config.model.sampler)
     if isinstance(workshop.generator, DiffusionGenerator):
         sampler = workshop.generator.sampler
     return {

@@ -1,16 +1,24 @@
 """Sampling inverts the noise that training adds, one generator per view, guidance in one pass."""
 
+import copy
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor, nn
 
-from extrap_train.config import ModelConfig, SamplerConfig
+from extrap_train.config import ModelConfig, SamplerConfig, SamplerOptions, sampler_for
 from extrap_train.diffusion.conditioning import Conditioning, filled_warp
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sample_views, view_generator
-from extrap_train.diffusion.schedule import even_in_log_snr, noise_schedule, solver_of
+from extrap_train.diffusion.schedule import (
+    ddim_timesteps,
+    even_in_log_snr,
+    noise_schedule,
+    solver_of,
+)
+from extrap_train.errors import InputError
 from extrap_train.views import PairBatch
 
 
@@ -118,6 +126,98 @@ class GaussianDenoiser(nn.Module):
         gain = (alpha * (1 - alpha)).sqrt() * (1 - self.spread**2)
         return gain * noisy / self.spread_at(alpha) ** 2
 
+    def scale_error(self, batch: PairBatch, options: SamplerConfig) -> float:
+        """Of the picture's scale, which is all that the flow changes."""
+        names = "abc"
+        drawn = [torch.randn(12, 16, 16, generator=view_generator(0, name)) for name in names]
+        timesteps = solver_of(self.schedule, options).timesteps
+        start = self.spread_at(self.schedule.alphas_cumprod[timesteps[0]])
+        made = sample_views(self, batch, options, [view_generator(0, n) for n in names])
+        ratio = made / nn.functional.pixel_shuffle(torch.stack(drawn), 2)
+        return float((ratio * start / self.spread - 1).abs().mean())
+
+
+@pytest.mark.parametrize("zero_snr", [False, True])
+def test_every_number_of_ddim_steps_falls_from_pure_noise(
+    config: ModelConfig, zero_snr: bool
+) -> None:
+    schedule = noise_schedule(
+        replace(config, prediction="v_prediction", zero_terminal_snr=zero_snr)
+    )
+    for count in range(1, 1001):
+        levels = ddim_timesteps(schedule, count)
+        assert len(levels) == count
+        assert 980 < levels[0] <= 999
+        assert (levels.diff() < 0).all()
+        assert levels[-1] >= 0
+
+
+@pytest.mark.parametrize("count", [50, 100, 200, 500])
+def test_the_published_numbers_keep_their_spacing(config: ModelConfig, count: int) -> None:
+    schedule = noise_schedule(replace(config, prediction="epsilon", zero_terminal_snr=False))
+    plain = copy.deepcopy(schedule)
+    plain.set_timesteps(count)
+    assert torch.equal(ddim_timesteps(schedule, count), plain.timesteps)
+
+
+@pytest.mark.parametrize("eta", [0.0, 1.0])
+@pytest.mark.parametrize(
+    ("prediction", "zero_snr", "count"),
+    [("epsilon", False, 50), ("sample", True, 2), ("sample", True, 50), ("v_prediction", True, 8)],
+)
+def test_a_step_is_diffusers_where_its_strides_have_no_rest(
+    config: ModelConfig, prediction: str, zero_snr: bool, count: int, eta: float
+) -> None:
+    """To the bit: the small model's two steps among them."""
+    schedule = noise_schedule(replace(config, prediction=prediction, zero_terminal_snr=zero_snr))
+    plain = copy.deepcopy(schedule)
+    plain.set_timesteps(count)
+    ours = solver_of(schedule, SamplerConfig(steps=count))
+    assert torch.equal(ours.timesteps, plain.timesteps)
+    ours_latent = plain_latent = torch.randn(1, 4, 3, 3, generator=view_generator(0, "start"))
+    for timestep in plain.timesteps:
+        generator = view_generator(0, str(timestep))
+        said, noise = (torch.randn(1, 4, 3, 3, generator=generator) for _ in range(2))
+        ours_latent = ours.step(said, timestep, ours_latent, eta, noise if eta else None)
+        plain_latent = plain.step(
+            said, timestep, plain_latent, eta=eta, variance_noise=noise if eta else None
+        ).prev_sample
+        assert torch.equal(ours_latent, plain_latent)
+
+
+@pytest.mark.parametrize("zero_snr", [False, True])
+def test_more_ddim_steps_come_nearer_to_the_flow(
+    config: ModelConfig, batch: PairBatch, zero_snr: bool
+) -> None:
+    """Those among them whose strides have a rest, from 333 steps on the greatest part of them."""
+    chosen = replace(config, prediction="v_prediction", zero_terminal_snr=zero_snr)
+    denoiser = GaussianDenoiser(ExtrapolationModel(chosen))
+    counts = (7, 15, 60, 150, 334, 600, 1000)
+    errors = [denoiser.scale_error(batch, SamplerConfig(steps=count)) for count in counts]
+    assert errors == sorted(errors, reverse=True)
+    assert errors[-1] < 0.01
+
+
+@pytest.mark.parametrize(
+    ("changed", "steps", "said"),
+    [
+        ({}, 1, r"steps=1: the published spacing needs one of 2, 4"),
+        ({}, 15, r"steps=15: the published spacing needs one of .*25, 40, 50"),
+        ({"prediction": "v_prediction"}, 50, "predicts `v_prediction`: leave it out"),
+        ({"prediction": "sample", "zero_terminal_snr": True}, 50, "predicts `sample`"),
+    ],
+)
+def test_sampling_as_published_is_refused_where_nothing_was_published(
+    config: ModelConfig, changed: dict[str, Any], steps: int, said: str
+) -> None:
+    of = {"prediction": "epsilon", "zero_terminal_snr": False} | changed
+    chosen = replace(config, **of)
+    options = SamplerConfig(steps=steps, compat="megascenes")
+    with pytest.raises(InputError, match=said):
+        solver_of(noise_schedule(chosen), options)
+    with pytest.raises(InputError, match=said):
+        sampler_for(SamplerOptions(steps=steps, compat="megascenes"), chosen)
+
 
 @pytest.mark.parametrize("zero_snr", [False, True])
 @pytest.mark.parametrize("solver", ["dpmpp", "unipc"])
@@ -127,20 +227,9 @@ def test_second_order_solvers_follow_the_flow_in_fewer_steps(
     """Against the exact solution of the flow: noise scaled by the spreads' ratio."""
     chosen = replace(config, prediction="v_prediction", zero_terminal_snr=zero_snr)
     denoiser = GaussianDenoiser(ExtrapolationModel(chosen))
-    names = "abc"
-    drawn = torch.stack([torch.randn(12, 16, 16, generator=view_generator(0, n)) for n in names])
-    noise = nn.functional.pixel_shuffle(drawn, 2)
-
-    def error(options: SamplerConfig) -> float:
-        """Of the picture's scale, which is all that the flow changes."""
-        timesteps = solver_of(denoiser.schedule, options).timesteps
-        start = denoiser.spread_at(denoiser.schedule.alphas_cumprod[timesteps[0]])
-        made = sample_views(denoiser, batch, options, [view_generator(0, n) for n in names])
-        return float(((made / noise) * start / denoiser.spread - 1).abs().mean())
-
-    first_order = error(SamplerConfig("ddim", steps=50))
-    assert error(SamplerConfig(solver, steps=15)) < first_order
-    assert error(SamplerConfig(solver, steps=60)) < 0.25 * first_order
+    first_order = denoiser.scale_error(batch, SamplerConfig("ddim", steps=50))
+    assert denoiser.scale_error(batch, SamplerConfig(solver, steps=15)) < first_order
+    assert denoiser.scale_error(batch, SamplerConfig(solver, steps=60)) < 0.25 * first_order
 
 
 def test_timesteps_even_in_log_snr_are_distinct_and_reach_both_ends(config: ModelConfig) -> None:
