@@ -204,8 +204,6 @@ def _take_over(
     grows = weight.shape[1] <= channels
     if family == "ours" and isinstance(model.autoencoder, PixelPatches):
         unet["conv_in.weight"] = narrowed(weight, model.autoencoder, own)
-        if own == "megascenes":
-            projection["weight"] = turned_pose(projection["weight"])
     elif family == "zeronvs" and grows:
         unet["conv_in.weight"] = widened(weight, channels)
     else:
@@ -214,6 +212,9 @@ def _take_over(
             f"takes {channels}: only zeronvs can be widened to another, and only a small `ours` "
             f"narrowed; choose model.family={family}"
         )
+    if own == "megascenes":
+        turned = turned_pose(projection["weight"], projection["bias"])
+        projection["weight"], projection["bias"] = turned
 
 
 def initial_model(config: ModelConfig) -> ExtrapolationModel:

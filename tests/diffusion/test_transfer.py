@@ -1,5 +1,6 @@
 """What one family takes over from another answers as it did, wherever both are told the same."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -60,23 +61,66 @@ def test_a_patch_of_one_colour_is_answered_as_its_rgb() -> None:
 
 
 def test_the_turned_projection_reads_megascenes_pose_as_zeronvs() -> None:
-    """Everything but the lens, for cameras so near that nothing is squashed."""
+    """For cameras so near that nothing is squashed, the lens as near as square pictures come."""
     batch = batch_of(3)
     reference, query = batch.reference_cameras[:, 0], batch.camera
     scale = depth_scale(batch.reference_depths[:, 0], every=1, least=1e-7) * 100
     weight = torch.randn(6, 4 + 19)
-    weight[:, -3:] = 0
+    bias = torch.randn(6)
     embedding = torch.zeros(3, 4)
-    before = torch.cat([embedding, zeronvs_pose(reference, query, scale)], 1) @ weight.T
+    before = torch.cat([embedding, zeronvs_pose(reference, query, scale)], 1)
     after = torch.cat([embedding, megascenes_pose(reference, query, scale)], 1)
-    torch.testing.assert_close(after @ turned_pose(weight).T, before, atol=1e-4, rtol=1e-4)
+    turned, turned_bias = turned_pose(weight, bias)
+    torch.testing.assert_close(
+        after @ turned.T + turned_bias, before @ weight.T + bias, atol=0.01, rtol=0
+    )
+    weight[:, -3:] = 0
+    turned, turned_bias = turned_pose(weight, bias)
+    assert torch.equal(turned_bias, bias)
+    torch.testing.assert_close(after @ turned.T, before @ weight.T, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("fov_deg", [20.0, 33.0, 60.0, 100.0])
+def test_the_turned_projection_reads_the_diagonal_as_a_side(fov_deg: float) -> None:
+    side = math.radians(fov_deg)
+    diagonal = 2 * math.atan(math.sqrt(2) * math.tan(side / 2))
+    turned, bias = turned_pose(torch.eye(19), torch.zeros(19))
+    told = torch.zeros(19)
+    told[-3:] = torch.tensor([diagonal, math.sin(diagonal), math.cos(diagonal)])
+    read = (turned @ told + bias)[-3:]
+    wanted = torch.tensor([side, math.sin(side), math.cos(side)])
+    torch.testing.assert_close(read, wanted, atol=0.006, rtol=0)
+
+
+@torch.no_grad()
+def test_megascenes_from_zeronvs_says_of_a_view_what_zeronvs_said(
+    config: ModelConfig, tmp_path: Path
+) -> None:
+    """Each is fed its own condition: other axes, units and lens, and a warp not heard yet."""
+    before = _saved(_of_family(config, "zeronvs"), tmp_path / "zeronvs")
+    torch.nn.init.normal_(before.cc_projection.weight)  # so that the pose is heard in the output
+    save_model(before, tmp_path / "zeronvs")
+    start = str(tmp_path / "zeronvs")
+    widened = initial_model(
+        replace(config, family="megascenes", residual=False, references=1, start=start)
+    )
+    batch = batch_of(1, references=1)
+    noisy, step = torch.randn(1, 12, 16, 16), torch.tensor([500])
+    conditions = [model.condition(batch) for model in (before, widened)]
+    tokens = [
+        model.cc_projection(condition.embedding)
+        for model, condition in zip((before, widened), conditions, strict=True)
+    ]
+    assert (tokens[1] - tokens[0]).abs().max() < 0.01 * tokens[0].std()
+    said = before(noisy, step, conditions[0])
+    assert (widened(noisy, step, conditions[1]) - said).abs().max() < 0.01 * said.std()
 
 
 def test_megascenes_from_ours_has_every_other_layer(config: ModelConfig, tmp_path: Path) -> None:
     ours = _saved(config, tmp_path / "ours")
     start = str(tmp_path / "ours")
     state = initial_model(replace(_of_family(config, "megascenes"), start=start)).state_dict()
-    changed = {"unet.conv_in.weight", "cc_projection.weight"}
+    changed = {"unet.conv_in.weight", "cc_projection.weight", "cc_projection.bias"}
     assert state["unet.conv_in.weight"].shape[1] == 12 + 12 + 3
     for name, value in ours.state_dict().items():
         assert name in changed or torch.equal(state[name], value), name
