@@ -32,8 +32,9 @@ class SceneOptions:
     input_frames: list[str] = field(default_factory=list)
     """Names of the input views, instead of a number."""
     weights: str | None = None
-    """Model folder, or a packaged model's name (`base`, `ours-hydrant`); null takes the category's
-    newest run, and the packaged model of the category before there is one.
+    """Model folder, a packaged model's name (`base`, `ours-hydrant`), or a published checkpoint of
+    the model that `model=` describes (`model=zeronvs weights=zeronvs.ckpt`); null takes the
+    category's newest run, and the packaged model of the category before there is one.
     """
     adapter: str | None = None
     """Folder of a scene's adapter, as `task=scene` leaves it, to put upon the weights."""

@@ -85,10 +85,10 @@ def is_compact(folder: Path) -> bool:
 
 
 def _read_compact(
-    folder: Path, wanted: Mapping[str, Shapes], config: ModelConfig
+    folder: Path, wanted: Mapping[str, Shapes], config: ModelConfig, option: str
 ) -> dict[str, tuple[WeightFile, dict[str, Tensor]]]:
     """Each part's tensors, as `read_published` gives them."""
-    file = WeightFile(folder / _COMPACT, "weights", "a model that task=pack wrote")
+    file = WeightFile(folder / _COMPACT, option, "a model that task=pack wrote")
     tensors = file.tensors(file.read())
     with safe_open(file.path, framework="pt") as opened:
         about = opened.metadata() or {}
@@ -133,13 +133,18 @@ def _save(tensors: dict[str, Tensor], path: Path, about: Mapping[str, str] | Non
         ) from None
 
 
-def load_model(folder: Path) -> ExtrapolationModel:
-    """The model of a folder written by `save_model`, in float32; strict."""
+def load_model(folder: Path, option: str = "weights") -> ExtrapolationModel:
+    """The model of a folder written by `save_model` that `option` named, in float32; strict."""
     config = _saved_config(folder)
     with torch.device("meta"):
         model = ExtrapolationModel(config)
-    load_weights(model, folder)
+    load_weights(model, folder, option)
     return model
+
+
+def is_own(path: Path) -> bool:
+    """Whether the path is a folder that says itself which model it holds."""
+    return (path / MODEL_CONFIG).is_file()
 
 
 def _saved_config(folder: Path) -> ModelConfig:
@@ -154,8 +159,8 @@ def _saved_config(folder: Path) -> ModelConfig:
         raise InputError(f"{folder / MODEL_CONFIG}: no model of this project ({error})") from None
 
 
-def load_weights(model: ExtrapolationModel, path: Path) -> None:
-    """Fill a model with the weights of a folder or of a published checkpoint.
+def load_weights(model: ExtrapolationModel, path: Path, option: str = "model.start") -> None:
+    """Fill a model with the weights of a folder or of a published checkpoint that `option` named.
 
     Names and shapes must be the same, but where one family starts from another (`transfer`).
     """
@@ -165,7 +170,7 @@ def load_weights(model: ExtrapolationModel, path: Path) -> None:
         for part, network in networks.items()
     }
     read = _read_compact if is_compact(path) else read_published
-    found = read(path, wanted, model.config)
+    found = read(path, wanted, model.config, option)
     file, unet = found["unet"]
     family = _family(path, file, unet["conv_in.weight"])
     if family != model.config.family:
@@ -178,7 +183,7 @@ def load_weights(model: ExtrapolationModel, path: Path) -> None:
 
 
 def _family(path: Path, file: WeightFile, conv_in: Tensor) -> str:
-    if (path / MODEL_CONFIG).is_file():
+    if is_own(path):
         return _saved_config(path).family
     channels = conv_in.shape[1]
     if channels not in _PUBLISHED_CHANNELS:
@@ -229,9 +234,14 @@ def initial_model(config: ModelConfig) -> ExtrapolationModel:
                 f"{SOURCES}"
             )
         return ExtrapolationModel(config)
+    return model_from(config.start, config, "model.start")
+
+
+def model_from(weights: str, config: ModelConfig, option: str) -> ExtrapolationModel:
+    """The configured model with the weights that `option` names, as `initial_model` knows them."""
     with torch.device("meta"):
         model = ExtrapolationModel(config)
-    given = Path(config.start)
+    given = Path(weights)
     path = given if is_compact(given) else weights_at(given)
-    load_weights(model, packaged_weights(config.start) if path is None else path)
+    load_weights(model, packaged_weights(weights, option) if path is None else path, option)
     return model

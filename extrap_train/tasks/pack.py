@@ -18,7 +18,9 @@ _BASE = "base"
 def run(config: TrainConfig) -> None:
     """Write the newest (or `weights`) model under the name that the package gives it."""
     console = Console()
-    model = open_model(config.weights or str(existing_run(config).model), config.adapter)
+    model = open_model(
+        config.weights or str(existing_run(config).model), config.adapter, config.model
+    )
     name = packaged_name(model.config.family, config.category.name)
     folder = Path(config.output) / "packed" / name
     folder.parent.mkdir(parents=True, exist_ok=True)

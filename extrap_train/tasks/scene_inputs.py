@@ -8,12 +8,12 @@ from lightning.fabric import Fabric
 from rich.console import Console
 
 from data_prep.views import choose_frames, input_views
-from extrap_train.config import SyntheticConfig, TrainConfig
+from extrap_train.config import ModelConfig, SyntheticConfig, TrainConfig
 from extrap_train.data.photographs import CATEGORY
 from extrap_train.data.scene import open_scene
 from extrap_train.data.sequences import Frame, Sequence
 from extrap_train.depth.build import depth_source
-from extrap_train.diffusion.checkpoint import load_model
+from extrap_train.diffusion.checkpoint import is_own, load_model, model_from
 from extrap_train.diffusion.lora import load_adapter
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.packaged import packaged_name, packaged_names, packaged_weights
@@ -67,7 +67,7 @@ def trained_model(config: TrainConfig) -> ExtrapolationModel:
     Before there is a run, the packaged model of the category takes its place, which is said.
     """
     if config.weights is not None:
-        return open_model(config.weights, config.adapter)
+        return open_model(config.weights, config.adapter, config.model)
     newest = newest_run(config).model
     if newest.is_dir():
         return open_model(str(newest), config.adapter)
@@ -88,10 +88,26 @@ def _packaged(config: TrainConfig) -> str:
     )
 
 
-def open_model(weights: str, adapter: str | None = None) -> ExtrapolationModel:
-    """The model of a folder or of the package, with a scene's adapter upon it if any."""
-    folder = Path(weights)
-    model = load_model(folder if folder.is_dir() else packaged_weights(weights, "weights"))
+def open_model(
+    weights: str, adapter: str | None = None, config: ModelConfig | None = None
+) -> ExtrapolationModel:
+    """The model of a folder, of the package or of a published checkpoint, with a scene's adapter
+    upon it if any.
+
+    A published checkpoint says not what it is: it is read as the model that `config` describes.
+    """
+    path = Path(weights)
+    if not path.exists():
+        path = packaged_weights(weights, "weights")
+    if is_own(path):
+        model = load_model(path)
+    elif config is not None:
+        model = model_from(weights, config, "weights")
+    else:
+        raise InputError(
+            f"weights={weights}: is no model folder of this project; a published checkpoint needs "
+            "the configuration of its model beside it"
+        )
     if adapter is not None:
         load_adapter(model, Path(adapter))
     return model.eval()

@@ -16,6 +16,7 @@ from data_prep.views import choose_frames, input_views
 from extrap_train.config import (
     DatasetDepthConfig,
     DepthConfig,
+    ModelConfig,
     SamplerConfig,
     TrainConfig,
     sampler_for,
@@ -62,12 +63,15 @@ def run(config: TrainConfig) -> None:
 
 
 def open_generator(
-    weights: str, adapter: str | None = None, sampler: SamplerConfig | None = None
+    weights: str,
+    adapter: str | None = None,
+    sampler: SamplerConfig | None = None,
+    config: ModelConfig | None = None,
 ) -> DiffusionGenerator:
-    """The generator of a model folder, or of a packaged model; without `sampler` it samples as the
-    model recommends.
+    """The generator of a model folder, of a packaged model, or of a published checkpoint, which
+    `config` describes; without `sampler` it samples as the model recommends.
     """
-    model = open_model(weights, adapter)
+    model = open_model(weights, adapter, config)
     return DiffusionGenerator(model, sampler or model.config.sampler)
 
 

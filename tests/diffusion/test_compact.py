@@ -27,7 +27,7 @@ def base(config: ModelConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     torch.manual_seed(0)
     save_model(ExtrapolationModel(config), tmp_path / "base", torch.float16)
 
-    def packaged(name: str) -> Path:
+    def packaged(name: str, option: str = "") -> Path:
         assert name == "base"
         return tmp_path / name
 

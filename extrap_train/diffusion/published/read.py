@@ -50,17 +50,19 @@ _LISTED = 5
 
 
 def read_published(
-    path: Path, wanted: Mapping[str, Shapes], config: ModelConfig
+    path: Path, wanted: Mapping[str, Shapes], config: ModelConfig, option: str
 ) -> dict[str, tuple[WeightFile, dict[str, Tensor]]]:
     """Each part's tensors under our names, in the file's precision, with the file they are from.
 
-    `path` is one that `weights_at` gave.
+    `path` is one that `weights_at` gave, `option` what named it.
     `wanted` has the tensors of `unet`, `cc_projection`, `vae` and `image_encoder`, each one's
     shape by its name. Raises InputError where the path holds no such weights, or not all of them.
     """
     if (path / "unet").is_dir():
-        return {part: _folder_part(path / part, part, shapes) for part, shapes in wanted.items()}
-    file = _weight_file(path)
+        return {
+            part: _folder_part(path / part, part, shapes, option) for part, shapes in wanted.items()
+        }
+    file = WeightFile(path, option, SOURCES)
     state = file.tensors(file.read(_LIGHTNING_REMARKS), "state_dict")
     parts = _from_latent_diffusion(file, state, wanted, config)
     return {part: (file, tensors) for part, tensors in parts.items()}
@@ -77,13 +79,12 @@ def weights_at(path: Path) -> Path | None:
     return next((file for file in inside if file.is_file()), None)
 
 
-def _weight_file(path: Path) -> WeightFile:
-    return WeightFile(path, "model.start", SOURCES)
-
-
-def _folder_part(folder: Path, part: str, shapes: Shapes) -> tuple[WeightFile, dict[str, Tensor]]:
+def _folder_part(
+    folder: Path, part: str, shapes: Shapes, option: str
+) -> tuple[WeightFile, dict[str, Tensor]]:
     candidates = [folder / (n + s) for s in _SUFFIXES for n in _FOLDER_FILES[part]]
-    file = _weight_file(next((path for path in candidates if path.is_file()), candidates[0]))
+    found = next((path for path in candidates if path.is_file()), candidates[0])
+    file = WeightFile(found, option, SOURCES)
     state = file.tensors(file.read())
     state.pop("vision_model.embeddings.position_ids", None)  # saved by older transformers
     missing = [name for name in shapes if name not in state]
