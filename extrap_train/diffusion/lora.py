@@ -58,7 +58,7 @@ def save_adapter(adapter: peft.PeftModel, folder: Path) -> None:
     shutil.rmtree(temporary, ignore_errors=True)
     try:
         adapter.save_pretrained(str(temporary))
-        base = {"sha256": _base_hash(adapter.get_base_model())}
+        base = {"sha256": base_hash(adapter.get_base_model())}
         write_whole(temporary / _BASE, json.dumps(base).encode())
         if folder.exists():
             shutil.rmtree(folder)
@@ -66,6 +66,15 @@ def save_adapter(adapter: peft.PeftModel, folder: Path) -> None:
         temporary.replace(folder)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def saved_base_hash(folder: Path) -> str | None:
+    """`base_hash` of the weights that a saved adapter is for; None where there is no adapter."""
+    try:
+        base = json.loads((folder / _BASE).read_text())["sha256"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return base if (folder / _WEIGHTS).is_file() else None
 
 
 def load_adapter(model: ExtrapolationModel, folder: Path) -> peft.PeftModel:
@@ -79,7 +88,7 @@ def load_adapter(model: ExtrapolationModel, folder: Path) -> peft.PeftModel:
         raise InputError(
             f"adapter={folder}: is no adapter folder of task=scene ({reason}); make it anew"
         ) from None
-    if wanted != _base_hash(model.unet):
+    if wanted != base_hash(model.unet):
         raise InputError(
             f"adapter={folder}: was trained upon other weights than these; give weights= as it was "
             "then, or adapt these with task=scene"
@@ -93,8 +102,8 @@ def load_adapter(model: ExtrapolationModel, folder: Path) -> peft.PeftModel:
     return adapter
 
 
-def _base_hash(unet: nn.Module) -> str:
-    """Of the denoiser's own weights, whether or not an adapter lies upon them."""
+def base_hash(unet: nn.Module) -> str:
+    """SHA-256 of the denoiser's own weights, whether or not an adapter lies upon them."""
     digest = hashlib.sha256()
     for name, value in sorted(unet.state_dict().items()):
         if ".lora_" not in name:

@@ -1,5 +1,6 @@
 """`task=scene`: a category model adapted to one scene from its input views alone."""
 
+import hashlib
 import io
 import json
 import math
@@ -20,7 +21,7 @@ from extrap_train.data.scene_pairs import ScenePairs
 from extrap_train.diffusion.adaptation import Adaptation, adapt
 from extrap_train.diffusion.evaluation import score_images, summarise
 from extrap_train.diffusion.generator import DiffusionGenerator, GeneratedViews
-from extrap_train.diffusion.lora import add_adapter, save_adapter
+from extrap_train.diffusion.lora import add_adapter, base_hash, save_adapter, saved_base_hash
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError
 from extrap_train.metrics import Distance, lpips_or_reason
@@ -46,11 +47,11 @@ def run(config: TrainConfig) -> Path:
     pairs = ScenePairs(inputs.views, model.config.told_references)
     folder = Path(config.output) / "scene" / inputs.label
     sampler = sampler_for(config.sampler, model.config)
-    asked = _asked(config, inputs, sampler)
+    targets = _targets(config, inputs, model)
+    asked = _asked(config, model, inputs.views, targets, sampler)
     if config.resume and _is_done(folder, asked):
         console.print(f"already adapted with these options: {folder}")
         return folder
-    targets = _targets(config, inputs, model)
     before = _generate(model, config, inputs, targets, fabric)
     adapter = add_adapter(model, config.lora, config.seed)
     with _bar() as bar:
@@ -79,22 +80,50 @@ def run(config: TrainConfig) -> Path:
     return folder
 
 
-def _asked(config: TrainConfig, inputs: SceneInputs, sampler: SamplerConfig) -> dict[str, Any]:
+def _asked(
+    config: TrainConfig,
+    model: ExtrapolationModel,
+    views: list[View],
+    targets: list[View],
+    sampler: SamplerConfig,
+) -> dict[str, Any]:
+    """All that the result follows from: weights and views by their content, not by their names."""
     return {
         "scene": config.scene,
-        "inputs": [view.name for view in inputs.views],
+        "inputs": [view.name for view in views],
+        "held_out": [view.name for view in targets],
+        "views": _digest(views + targets),
         "weights": config.weights,
+        "model": asdict(model.config),
+        "base": base_hash(model.unet),
         "depth": asdict(config.depth),
         "lora": asdict(config.lora),
         "sampler": asdict(sampler),
+        "precision": config.trainer.precision,
+        "lpips": config.validation.lpips_weights,
         "minutes": config.minutes,
         "seed": config.seed,
     }
 
 
+def _digest(views: list[View]) -> str:
+    digest = hashlib.sha256()
+    for view in views:
+        tensors = (view.image, view.depth, view.camera.world_to_cam, view.camera.intrinsics)
+        for tensor in tensors:
+            if tensor is not None:
+                digest.update(tensor.cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
 def _is_done(folder: Path, asked: dict[str, Any]) -> bool:
-    summary = folder / "summary.json"
-    return summary.is_file() and json.loads(summary.read_text())["asked"] == asked
+    """Whether the adapter lies there that was made of this, with its numbers beside it."""
+    try:
+        found = json.loads((folder / "summary.json").read_text())["asked"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+    same = found == json.loads(json.dumps(asked))
+    return same and saved_base_hash(folder / "adapter") == asked["base"]
 
 
 def _targets(config: TrainConfig, inputs: SceneInputs, model: ExtrapolationModel) -> list[View]:

@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 import sys
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from PIL import Image
 
 from extrap_train.__main__ import main
 from extrap_train.config import ModelConfig, UNetConfig
-from extrap_train.diffusion.checkpoint import save_model
+from extrap_train.diffusion.checkpoint import load_model, save_model
 from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.tasks.view import open_generator, open_views, walk
@@ -112,6 +113,35 @@ def test_an_adapter_is_made_used_again_and_put_upon_the_weights(
     assert "already adapted with these options" in capsys.readouterr().out
     adapter = f"adapter={folder / 'adapter'}"
     command("task=view", f"weights={weights}", adapter, "pose=frame000003")
+
+
+def test_an_adapter_is_made_anew_for_other_weights_of_the_same_name(
+    command, weights, tmp_path, capsys
+) -> None:
+    """As after a longer training; or where the adapter is gone, or its summary cannot be read."""
+    folder, model = tmp_path / "scene" / "hydrant-0000", tmp_path / "model"
+    shutil.copytree(weights, model)
+    options = ["minutes=0.2", "lora.steps=2", "lora.validate_every=2", "lora.batch_size=2"]
+
+    def is_made() -> bool:
+        capsys.readouterr()
+        command("task=scene", f"weights={model}", *options)
+        return "already adapted" not in capsys.readouterr().out
+
+    assert is_made()
+    assert not is_made()
+    trained_on = load_model(model)
+    torch.nn.init.normal_(trained_on.unet.conv_out.weight, std=0.05)
+    save_model(trained_on, model)
+    assert is_made()
+    command("task=view", f"weights={model}", f"adapter={folder / 'adapter'}", "pose=frame000003")
+    shutil.rmtree(folder / "adapter")
+    assert is_made()
+    (folder / "summary.json").write_text('{"asked"')
+    assert is_made()
+    options += ["data.seed=5"]  # the same name, other photographs
+    assert is_made()
+    assert not is_made()
 
 
 def test_before_a_run_the_category_s_packaged_model_paints_and_says_so(
