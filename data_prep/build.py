@@ -63,7 +63,7 @@ class _Plan:
             keys = CaptureKeys.of(sequence)
             capture_keys.append(keys.frames_key(depth, size))
             qualities = [sequence.viewpoint_quality, sequence.point_cloud_quality]
-            traits = [sequence.category, sequence.name, qualities, keys.content]
+            traits = [sequence.category, sequence.name, qualities, keys.content, keys.sizes]
             digest.update(json.dumps(traits).encode())
         return cls(sequences, capture_keys, shop, test_names, digest.hexdigest())
 

@@ -36,18 +36,22 @@ class CaptureKeys:
     """Of names and cameras: the same wherever the capture lies."""
     files: str
     """Of sizes and times of the photographs, masks and depth maps."""
+    sizes: str
+    """Of their sizes alone: the same for a copy."""
 
     @classmethod
     def of(cls, sequence: Sequence) -> "CaptureKeys":
         """Looks at every file's entry in its folder."""
-        content, files = hashlib.sha256(), hashlib.sha256()
+        content, files, sizes = hashlib.sha256(), hashlib.sha256(), hashlib.sha256()
         for frame in sequence.frames:
             traits = [frame.name, frame.camera.height, frame.camera.width, frame.has_depth]
             content.update(json.dumps([*traits, frame.has_mask]).encode())
             content.update(frame.camera.world_to_cam.numpy(force=True).tobytes())
             content.update(frame.camera.intrinsics.numpy(force=True).tobytes())
-            files.update(json.dumps([file_stamp(file) for file in frame.files]).encode())
-        return cls(content.hexdigest(), files.hexdigest())
+            stamps = [file_stamp(file) for file in frame.files]
+            files.update(json.dumps(stamps).encode())
+            sizes.update(json.dumps([stamp and stamp[0] for stamp in stamps]).encode())
+        return cls(content.hexdigest(), files.hexdigest(), sizes.hexdigest())
 
     def frames_key(self, depth: str, image_size: int) -> str:
         """A hash of what frames are made from; `depth` says by what theirs is found."""

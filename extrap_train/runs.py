@@ -15,6 +15,7 @@ import yaml
 from extrap_train.config import SceneOptions, SyntheticConfig, TrainConfig, dotted
 from extrap_train.data.files import partial_beside, write_whole
 from extrap_train.errors import InputError
+from extrap_train.trained_on import TRAINED_ON, TrainedOn
 
 _NOT_PART_OF_THE_RUN = (
     "output",
@@ -70,6 +71,11 @@ class RunFolder:
         return self.path / "model"
 
     @property
+    def data(self) -> Path:
+        """What the run is trained on (`TrainedOn`)."""
+        return self.path / TRAINED_ON
+
+    @property
     def summary(self) -> Path:
         """The result; a run that has it for the wanted number of steps is finished."""
         return self.path / "summary.json"
@@ -102,9 +108,7 @@ def _digest(identity: dict[str, Any]) -> str:
 
 def run_folder(config: TrainConfig) -> RunFolder:
     """Where the run lies or will lie; raises InputError where no folder may be called so."""
-    name = config.run or f"seed{config.seed}-{_digest(run_identity(config))[:8]}"
-    if name == _LATEST or Path(name).name != name:
-        raise InputError(f"run={name}: must be the name of a folder, other than {_LATEST}")
+    name = _given_name(config) or f"seed{config.seed}-{_digest(run_identity(config))[:8]}"
     return RunFolder(_runs_of(config) / name)
 
 
@@ -126,15 +130,32 @@ def open_run(config: TrainConfig) -> RunFolder:
 
 def existing_run(config: TrainConfig) -> RunFolder:
     """The finished run that `run` names, by default the newest; InputError where there is none."""
-    folder = RunFolder(_runs_of(config) / config.run) if config.run else newest_run(config)
+    name = _given_name(config)
+    folder = RunFolder(_runs_of(config) / name) if name else newest_run(config)
     if not folder.summary.is_file():
         raise InputError(f"{folder.path}: holds no finished run; train one (task=category)")
     return folder
 
 
+def note_data(folder: RunFolder, trained_on: TrainedOn) -> None:
+    """Keep what a run is trained on before its first step; InputError where that was another."""
+    if folder.summary.is_file() or any(folder.checkpoints.glob("*.ckpt")):
+        trained_on.require_same(folder.data)
+    else:
+        trained_on.write(folder.data)
+
+
 def newest_run(config: TrainConfig) -> RunFolder:
     """Where the category's newest run is, if there is one."""
     return RunFolder(_runs_of(config) / _LATEST)
+
+
+def _given_name(config: TrainConfig) -> str | None:
+    """`run`, if that can be a folder among the runs and is not the link to the newest."""
+    name = config.run
+    if name and (name in (".", "..", _LATEST) or {"/", "\\", "\0"} & set(name)):
+        raise InputError(f"run={name!r}: must be the name of a folder, other than {_LATEST}")
+    return name
 
 
 def _runs_of(config: TrainConfig) -> Path:
@@ -144,6 +165,7 @@ def _runs_of(config: TrainConfig) -> Path:
 def _start_over(folder: RunFolder) -> None:
     """Remove what would make a later command resume the old run, or take it for finished."""
     folder.summary.unlink(missing_ok=True)
+    folder.data.unlink(missing_ok=True)
     shutil.rmtree(folder.checkpoints, ignore_errors=True)
     shutil.rmtree(folder.averages, ignore_errors=True)
     (folder.path / "metrics.csv").unlink(missing_ok=True)
@@ -153,7 +175,7 @@ def _check_same(saved: Path, identity: dict[str, Any], config: TrainConfig) -> N
     """Options that the run's version did not have yet had their default."""
     try:
         before = dotted(yaml.safe_load(saved.read_text()))
-    except (yaml.YAMLError, AttributeError) as error:
+    except (yaml.YAMLError, UnicodeDecodeError, AttributeError) as error:
         raise InputError(
             f"{saved}: unreadable ({error}); remove the run or choose run=NAME"
         ) from None

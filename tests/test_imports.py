@@ -23,6 +23,7 @@ _RANK = {
     "extrap_train.pictures": 4,
     "extrap_train.processes": 4,
     "extrap_train.diffusion": 5,
+    "extrap_train.trained_on": 4,
     "extrap_train.runs": 5,
     "extrap_train.sweep": 5,
     "extrap_train.sweep_seeds": 2,

@@ -18,7 +18,7 @@ from extrap_train.config import (
 )
 from extrap_train.config import DatasetDepthConfig as Depth
 from extrap_train.errors import InputError
-from extrap_train.runs import open_run, point_latest
+from extrap_train.runs import _runs_of, existing_run, open_run, point_latest
 
 _NAME_BEFORE = "seed0-ca916ebe"
 """Of the default run of a category, from when the last option was added that had to rename it."""
@@ -114,10 +114,23 @@ def test_another_download_is_another_run(config: TrainConfig) -> None:
     assert open_run(moved) == open_run(config)
 
 
-@pytest.mark.parametrize("name", ["latest", "../other", "a/b"])
+@pytest.mark.parametrize("name", ["latest", "../other", "a/b", ".", "..", "a/", "a\\b", "/a"])
 def test_a_run_has_the_name_of_a_folder(config: TrainConfig, name: str) -> None:
-    with pytest.raises(InputError, match="must be the name of a folder"):
-        open_run(replace(config, run=name))
+    """Else `resume=false` would remove what lies beside or above all runs."""
+    precious = _runs_of(config) / "summary.json"
+    precious.parent.mkdir(parents=True)
+    precious.touch()
+    for find in (open_run, existing_run):
+        with pytest.raises(InputError, match="must be the name of a folder"):
+            find(replace(config, run=name, resume=False))
+    assert precious.exists()
+
+
+def test_options_that_are_no_text_are_one_line(config: TrainConfig) -> None:
+    saved = open_run(replace(config, run="mine")).path / "config.yaml"
+    saved.write_bytes(b"\xff\xfe\xfa")
+    with pytest.raises(InputError, match=r"unreadable.*choose run=NAME"):
+        open_run(replace(config, run="mine"))
 
 
 def test_an_option_that_changes_nothing_renames_no_run(config: TrainConfig) -> None:

@@ -16,6 +16,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from rich.console import Console
 
 from extrap_train.config import TrainConfig
+from extrap_train.data.store import PreparedData
 from extrap_train.diffusion.averages import PowerAverages
 from extrap_train.diffusion.callbacks import (
     AveragedWeights,
@@ -32,9 +33,10 @@ from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.errors import InputError
 from extrap_train.metrics import Distance, lpips_or_reason
 from extrap_train.processes import Opening, announce, is_first, join
-from extrap_train.runs import RunFolder, open_run, point_latest, provenance, run_folder
+from extrap_train.runs import RunFolder, note_data, open_run, point_latest, provenance, run_folder
 from extrap_train.tasks.results import Results, draw_curve, draw_views, is_finished, write_results
 from extrap_train.tasks.training_data import data_module, prepared_data, validation_names
+from extrap_train.trained_on import TrainedOn
 
 
 def run(config: TrainConfig) -> Path:
@@ -65,6 +67,7 @@ def _opened(folder: RunFolder, config: TrainConfig) -> Iterator[Opening]:
             open_run(config)
             is_over = config.resume and is_finished(folder, config)
             if is_over:
+                _prepared(config, folder)
                 point_latest(folder)
             newest = checkpoints(folder.checkpoints)[-1:]
             opening = Opening(is_over, str(newest[0]) if newest else None)
@@ -86,7 +89,7 @@ def _train(
     console: Console,
 ) -> None:
     started = time.perf_counter()
-    prepared = prepared_data(config)
+    prepared = _prepared(config, folder)
     if is_first():
         point_latest(folder)
     seconds = {"prepare": time.perf_counter() - started}
@@ -114,6 +117,14 @@ def _train(
     )
     draw_curve(folder)
     write_results(results, config, folder, console)
+
+
+def _prepared(config: TrainConfig, folder: RunFolder) -> list[PreparedData]:
+    """The member categories; InputError where the run was begun with others."""
+    prepared = prepared_data(config)
+    if is_first():
+        note_data(folder, TrainedOn.of(config.category.members, prepared))
+    return prepared
 
 
 def quieten_lightning() -> None:

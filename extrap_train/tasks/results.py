@@ -38,7 +38,10 @@ class Results:
 
 
 def is_finished(folder: RunFolder, config: TrainConfig) -> bool:
-    """Whether the summary is there for at least these steps and for this way of measuring."""
+    """Whether the summary is there for at least these steps and for this way of measuring.
+
+    That the data are the same is `note_data`'s to see.
+    """
     if not folder.summary.is_file():
         return False
     summary = json.loads(folder.summary.read_text())

@@ -1,0 +1,118 @@
+"""What a run is trained on, beside its configuration: the data may change while that stays."""
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from extrap_train.data.files import write_whole
+from extrap_train.data.json_files import read_json
+from extrap_train.data.store import PreparedData
+from extrap_train.data.validation import require_dict
+from extrap_train.errors import InputError
+
+TRAINED_ON = "data.json"
+"""In a run's folder."""
+
+
+@dataclass(frozen=True)
+class CategoryData:
+    """One member category as it was prepared for a run."""
+
+    source: str
+    """`synthetic` or `co3d`."""
+    key: str
+    """Of captures and options, the same on every machine (the preparation's manifest)."""
+    split: str
+    """Hash of what is trained on and what is tested on."""
+    train: tuple[str, ...]
+    """Sequences whose frames are trained on, but for those held out; no category."""
+    test: tuple[str, ...]
+    """Sequences that are for testing alone."""
+
+    @classmethod
+    def of(cls, prepared: PreparedData) -> "CategoryData":
+        """As it lies prepared."""
+        names = {
+            tested: sorted(
+                name.split("/", 1)[1]
+                for name, role in prepared.roles.items()
+                if (role == "test") is tested
+            )
+            for tested in (False, True)
+        }
+        manifest = prepared.manifest
+        return cls(
+            source=(manifest["data"] or {}).get("name", ""),
+            key=manifest["key"],
+            split=manifest["split"],
+            train=tuple(names[False]),
+            test=tuple(names[True]),
+        )
+
+
+@dataclass(frozen=True)
+class TrainedOn:
+    """The categories of a run, by name."""
+
+    categories: Mapping[str, CategoryData]
+
+    @classmethod
+    def of(cls, members: Iterable[str], prepared: Iterable[PreparedData]) -> "TrainedOn":
+        """The member categories as they lie prepared."""
+        pairs = zip(members, prepared, strict=True)
+        return cls({member: CategoryData.of(data) for member, data in pairs})
+
+    @classmethod
+    def read(cls, file: Path) -> "TrainedOn":
+        """What `write` wrote; InputError where that is damaged."""
+        content = require_dict(read_json(file), "an object with a category each", file)
+        try:
+            return cls(
+                {
+                    name: CategoryData(
+                        **{**entry, "train": tuple(entry["train"]), "test": tuple(entry["test"])}
+                    )
+                    for name, entry in content.items()
+                }
+            )
+        except (TypeError, KeyError) as error:
+            raise InputError(
+                f"{file}: says not what the run was trained on ({error}); restore it, or choose "
+                "another run=NAME"
+            ) from None
+
+    def write(self, file: Path) -> None:
+        """As JSON, whole or not at all."""
+        content = {name: asdict(data) for name, data in self.categories.items()}
+        write_whole(file, (json.dumps(content, indent=1) + "\n").encode())
+
+    def require_same(self, file: Path) -> None:
+        """InputError unless a run that is to go on was trained on the same, as `file` says."""
+        remedy = "choose another run=NAME, or resume=false to start over"
+        if not file.is_file():
+            raise InputError(
+                f"{file.parent}: was begun before runs noted what they are trained on ({file.name} "
+                f"is missing), so nobody can tell whether the data are still the same: {remedy}"
+            )
+        before = TrainedOn.read(file).categories
+        changed = [
+            f"{name} ({_difference(before.get(name), data)})"
+            for name, data in self.categories.items()
+            if before.get(name) != data
+        ]
+        if changed:
+            raise InputError(
+                f"{file.parent}: its data have changed since it was begun: {', '.join(changed)}; "
+                f"put them back as they were, or {remedy}"
+            )
+
+
+def _difference(before: CategoryData | None, now: CategoryData) -> str:
+    if before is None:
+        return "it was no member"
+    if before.split != now.split:
+        fresh = sorted({*before.test} & {*now.train} | {*before.train} & {*now.test})
+        moved = f", {len(fresh)} sequences have changed sides: {fresh[0]}" if fresh else ""
+        return f"another split{moved}"
+    return "other photographs, cameras or preparation"
