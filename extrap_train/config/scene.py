@@ -28,7 +28,9 @@ class SceneOptions:
     or a COLMAP model.
     """
     inputs: int | None = None
-    """Input views, spread around the scene; null takes every frame."""
+    """Input views, spread around the scene; null takes every frame. The one that `pose` names is
+    none of them.
+    """
     input_frames: list[str] = field(default_factory=list)
     """Names of the input views, instead of a number."""
     weights: str | None = None

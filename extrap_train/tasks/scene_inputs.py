@@ -1,6 +1,6 @@
 """What the tasks about one scene start from: its views, and the model that sees them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -50,14 +50,23 @@ def required_scene(config: TrainConfig) -> str:
     return config.scene
 
 
-def open_inputs(config: TrainConfig, image_size: int) -> SceneInputs:
-    """The scene's input views at this size; depth comes from these views alone."""
+def open_inputs(config: TrainConfig, image_size: int, query: str | None = None) -> SceneInputs:
+    """The scene's input views at this size; depth comes from these views alone.
+
+    The frame called `query` is none of them, so that it can be compared with, unless
+    `input_frames` names it.
+    """
     scene = required_scene(config)
     synthetic = config.data if isinstance(config.data, SyntheticConfig) else None
     sequence = open_scene(scene, synthetic)
-    chosen = choose_frames(sequence, config.input_frames, config.inputs)
-    views = input_views(sequence, chosen, depth_source(config.depth), image_size)
-    others = [frame for i, frame in enumerate(sequence.frames) if i not in chosen]
+    known = [frame for frame in sequence.frames if frame.name != query]
+    part = sequence if config.input_frames else replace(sequence, frames=tuple(known))
+    if not part.frames:
+        raise InputError(f"scene {scene}: {query} is its only frame, and is asked for; give more")
+    chosen = choose_frames(part, config.input_frames, config.inputs)
+    views = input_views(part, chosen, depth_source(config.depth), image_size)
+    names = {view.name for view in views}
+    others = [frame for frame in sequence.frames if frame.name not in names]
     return SceneInputs(sequence, views, others)
 
 

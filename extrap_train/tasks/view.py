@@ -48,7 +48,7 @@ def run(config: TrainConfig) -> None:
         raise InputError("task=view needs a pose=FRAME|FILE.json or an orbit=DEGREES, one of both")
     fabric = fabric_of(config)
     model = trained_model(config).to(fabric.device)
-    inputs = open_inputs(config, model.config.warp_size)
+    inputs = open_inputs(config, model.config.warp_size, config.pose)
     names, cameras, truth = _queries(config, inputs, model.config.image_size)
     with fabric.autocast():
         generator = DiffusionGenerator(model, sampler_for(config.sampler, model.config))
@@ -57,9 +57,15 @@ def run(config: TrainConfig) -> None:
     _write(made, inputs.views, names, folder, walk=config.orbit is not None)
     if truth is not None:
         picture(truth.image, folder / "truth.png")
-        found = float(psnr(quantised(made.images), quantised(truth.image[None])))
-        console.print(f"PSNR against the photograph: {found:.2f} dB")
+        console.print(_compared(made, truth, inputs))
     console.print(f"result: {folder}")
+
+
+def _compared(made: GeneratedViews, truth: View, inputs: SceneInputs) -> str:
+    if truth.name in {view.name for view in inputs.views}:
+        return f"no PSNR: {truth.name} is an input itself; leave it out of input_frames"
+    found = float(psnr(quantised(made.images), quantised(truth.image[None])))
+    return f"PSNR against the photograph: {found:.2f} dB"
 
 
 def open_generator(
@@ -120,7 +126,8 @@ def _queries(
             f"pose={config.pose}: is neither a frame of the scene nor a .json file; its frames are "
             f"{', '.join(list(known)[:4])}, …"
         )
-    truth = replace(object_square(known[config.pose].load(), size), depth=None)
+    square = object_square(known[config.pose].load(), size)
+    truth = replace(square, depth=None, name=config.pose)
     return [config.pose], stack_cameras([truth.camera]), truth
 
 

@@ -74,6 +74,31 @@ def test_a_frame_as_pose_has_its_photograph_beside_it(command, weights, tmp_path
     assert "PSNR against the photograph" in capsys.readouterr().out
 
 
+def test_the_photograph_that_is_asked_for_is_no_input(
+    command, weights, tmp_path, capsys, monkeypatch
+) -> None:
+    """By default every frame is one, and the nearest to its own pose would be itself."""
+    given = []
+    generate = DiffusionGenerator.generate
+
+    def recorded(self, references, queries, names, seed=0):
+        given.append([view.name for view in references])
+        return generate(self, references, queries, names, seed)
+
+    monkeypatch.setattr(DiffusionGenerator, "generate", recorded)
+    for inputs, count in (("null", 7), ("7", 7)):
+        command("task=view", f"weights={weights}", "pose=frame000003", f"inputs={inputs}")
+        assert len(given[-1]) == count
+        assert "frame000003" not in given[-1]
+        assert "PSNR against the photograph" in capsys.readouterr().out
+    named = "input_frames=[frame000001,frame000003,frame000005]"
+    command("task=view", f"weights={weights}", "pose=frame000003", named)
+    assert "frame000003" in given[-1]
+    said = capsys.readouterr().out
+    assert "no PSNR: frame000003 is an input itself" in said
+    assert "PSNR against" not in said
+
+
 def test_the_same_in_three_lines_of_python(weights) -> None:
     generator = open_generator(str(weights))
     views = open_views("synthetic:cup/0001", generator, inputs=3)
