@@ -1,8 +1,11 @@
 """Contact sheets: what a person looks at beside the numbers."""
 
 import io
+import itertools
 import os
-from pathlib import Path
+import re
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
 
 import cv2
 import matplotlib.pyplot as plt
@@ -18,6 +21,9 @@ from extrap_train.errors import InputError
 
 _HOLE_COLOUR = (1.0, 0.0, 1.0)
 _LEAST_TILE_PIXELS = 128
+_PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+_STEM_BYTES = 200
+"""With what is put behind it, a name stays one that every file system takes."""
 
 
 def colour_depth(depth: Float[Tensor, "b h w"]) -> Float[Tensor, "b 3 h w"]:
@@ -97,6 +103,29 @@ def picture(image: Float[Tensor, "3 h w"], path: Path) -> None:
     content = io.BytesIO()
     Image.fromarray(to_eight_bits(image).transpose(1, 2, 0)).save(content, "png")
     write_whole(path, content.getvalue())
+
+
+def picture_names(names: Sequence[str]) -> list[str]:
+    """A file name each, without suffix, for names that may be paths; no two meet, whatever their
+    case and also with `_warp` behind one.
+    """
+    taken: set[str] = set()
+    chosen = []
+    for name in names:
+        path = PurePosixPath(name)
+        plain = path.with_suffix("") if path.suffix.lower() in _PICTURES else path
+        stem = "_".join(part for part in plain.parts if part not in ("/", "."))
+        stem = re.sub(r"[^\w.+-]", "_", stem or "view")
+        stem = stem.encode()[:_STEM_BYTES].decode(errors="ignore")
+        numbered = (f"{stem}-{number}" for number in itertools.count(2))
+        free = next(
+            text
+            for text in itertools.chain([stem], numbered)
+            if not taken & {text.lower(), f"{text}_warp".lower()}
+        )
+        taken |= {free.lower(), f"{free}_warp".lower()}
+        chosen.append(free)
+    return chosen
 
 
 def film(images: Float[Tensor, "n 3 h w"], path: Path, frames_per_second: int = 12) -> None:

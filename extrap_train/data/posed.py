@@ -64,14 +64,15 @@ def read_cameras(file: Path) -> tuple[list[str], Camera]:
     """Names and pinhole cameras of a file laid out like `transforms.json` that has no pictures.
 
     Every entry needs a `transform_matrix` and, itself or for all, the size `w`, `h` and a lens. All
-    entries must have one size. Raises InputError that names the entry otherwise.
+    entries must have one size. Raises InputError that names the entry otherwise, or where a name
+    is no path below a folder.
     """
     content = require_dict(read_json(file), "an object with a list `frames`", file)
     entries = require_list(content.get("frames"), "frames", file)
     names, cameras = [], []
     for index, entry in enumerate(entries):
         entry = content | require_dict(entry, f"an object as frame {index}", file)
-        name = str(entry.get("file_path", f"{index:03d}"))
+        name = check_relative(str(entry.get("file_path", f"{index:03d}")), file)
         if "w" not in entry or "h" not in entry:
             raise InputError(f"{file}: neither the file nor its entry {name} has w and h; add them")
         names.append(name)

@@ -21,6 +21,7 @@ from extrap_train.config import (
     TrainConfig,
     sampler_for,
 )
+from extrap_train.data.files import whole_folder
 from extrap_train.data.posed import read_cameras
 from extrap_train.data.scene import open_scene
 from extrap_train.depth.build import depth_source
@@ -28,7 +29,7 @@ from extrap_train.diffusion.generator import DiffusionGenerator, GeneratedViews
 from extrap_train.errors import InputError
 from extrap_train.geometry.orbits import LEAST_VIEWS, orbit_cameras
 from extrap_train.metrics import psnr, quantised
-from extrap_train.pictures import contact_sheet, film, mark_holes, picture
+from extrap_train.pictures import contact_sheet, film, mark_holes, picture, picture_names
 from extrap_train.tasks.scene_inputs import (
     SceneInputs,
     fabric_of,
@@ -54,9 +55,11 @@ def run(config: TrainConfig) -> None:
         generator = DiffusionGenerator(model, sampler_for(config.sampler, model.config))
         made = generator.generate(inputs.views, cameras, names, config.seed)
     folder = Path(config.output) / "view" / inputs.label
-    _write(made, inputs.views, names, folder, walk=config.orbit is not None)
+    with whole_folder(folder, lambda _: False) as whole:  # nothing of another pose's stays in it
+        _write(made, inputs.views, names, whole, walk=config.orbit is not None)
+        if truth is not None:
+            picture(truth.image, whole / "truth.png")
     if truth is not None:
-        picture(truth.image, folder / "truth.png")
         console.print(_compared(made, truth, inputs))
     console.print(f"result: {folder}")
 
@@ -139,8 +142,7 @@ def _write(
         for end in ("gif", "mp4"):
             film(made.images, folder / f"orbit.{end}")
             film(warps, folder / f"orbit_warp.{end}")
-    for name, image, warp in zip(names, made.images, warps, strict=True):
-        stem = Path(name).stem
+    for stem, image, warp in zip(picture_names(names), made.images, warps, strict=True):
         picture(image, folder / "views" / f"{stem}.png")
         picture(warp, folder / "views" / f"{stem}_warp.png")
     size = made.images.shape[-1]

@@ -9,6 +9,8 @@ from pathlib import Path
 import cv2
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from PIL import Image
 
 from extrap_train.__main__ import main
@@ -16,6 +18,7 @@ from extrap_train.config import ModelConfig, UNetConfig
 from extrap_train.diffusion.checkpoint import load_model, save_model
 from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.pictures import picture_names
 from extrap_train.tasks.view import open_generator, open_views, walk
 
 _UNET = UNetConfig(channels=[16, 32], attention_levels=[False, True], heads=2, token_width=16)
@@ -106,12 +109,13 @@ def test_the_same_in_three_lines_of_python(weights) -> None:
     assert images.shape == (2, 3, 16, 16)
 
 
-def _poses(path: Path, translation: float) -> Path:
-    """A camera of 512 pixels with a lens of its own."""
+def _poses(path: Path, translation: float, *names: str) -> Path:
+    """A camera of 512 pixels with a lens of its own, once or by several names."""
     matrix = torch.eye(4)
     matrix[2, 3] = translation
     entry = {"transform_matrix": matrix.tolist(), "w": 512, "h": 512, "fl_x": 300.0}
-    path.write_text(json.dumps({"frames": [entry]}))
+    named = [entry | {"file_path": name} for name in names]
+    path.write_text(json.dumps({"frames": named or [entry]}))
     return path
 
 
@@ -119,6 +123,35 @@ def test_poses_come_from_a_file_with_any_lens(command, weights, tmp_path) -> Non
     poses = _poses(tmp_path / "poses.json", 4.0)
     command("task=view", f"weights={weights}", f"pose={poses}")
     assert (tmp_path / "view" / "hydrant-0000" / "views" / "000.png").is_file()
+
+
+def test_pictures_of_all_names_lie_beside_each_other_and_nothing_else_does(
+    command, weights, tmp_path
+) -> None:
+    """Neither what another pose left, nor one picture in the other's place."""
+    folder = tmp_path / "view" / "hydrant-0000"
+    command("task=view", f"weights={weights}", "pose=frame000003")
+    assert (folder / "truth.png").is_file()
+    names = ["left/0001.png", "right/0001.png", "img.1", "img.2", "./a", "a_warp", "A", "a"]
+    poses = _poses(tmp_path / "poses.json", 4.0, *names)
+    command("task=view", f"weights={weights}", f"pose={poses}")
+    assert {path.name for path in folder.iterdir()} == {"views", "sheet.png"}
+    assert len(list((folder / "views").iterdir())) == 2 * len(names)
+    assert (folder / "views" / "left_0001.png").is_file()
+    assert (folder / "views" / "img.2_warp.png").is_file()
+    for odd in ("a\0b", "../a", "", "\ud800"):
+        message = _refused(
+            command, "task=view", f"weights={weights}", f"pose={_poses(poses, 4.0, odd)}"
+        )
+        assert str(poses) in message
+
+
+@given(st.lists(st.text(min_size=1), max_size=12))
+def test_no_two_pictures_have_one_name(names: list[str]) -> None:
+    stems = picture_names(names)
+    files = [f"{stem}{end}.png".lower() for stem in stems for end in ("", "_warp")]
+    assert len(set(files)) == 2 * len(names)
+    assert not any("/" in file or len(file.encode()) > 255 for file in files)
 
 
 def test_an_adapter_is_made_used_again_and_put_upon_the_weights(
