@@ -63,6 +63,11 @@ def _error(arguments: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
         (["category=hydrant", "model.patch=7"], "no multiple of 56"),
         (["category=hydrant", "data=co3d"], "give data.root=FOLDER"),
         (
+            ["category=hydrant", "model=small_megascenes", "model.geometry=true"],
+            "model.family=megascenes is told no depth of the warp",
+        ),
+        (["category=hydrant", "sampler.compat=megascenes"], "predicts `sample`: leave it out"),
+        (
             ["category=hydrant", "model=small_megascenes", "model.references=3"],
             "told of the nearest alone: give model.references=1",
         ),

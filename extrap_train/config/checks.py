@@ -186,6 +186,11 @@ def _check_model(model: ModelConfig, prep: PrepConfig) -> None:
             "model.residual=true needs a warp, which model.family=zeronvs is not told: give "
             "model.residual=false"
         )
+    if model.geometry and model.family != "ours":
+        raise InputError(
+            f"model.geometry=true, but model.family={model.family} is told no depth of the warp: "
+            "leave it out"
+        )
     if model.references > 1 and model.family in NEAREST_ALONE:
         raise InputError(
             f"model.references={model.references}, but model.family={model.family} is told of the "

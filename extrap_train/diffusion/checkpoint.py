@@ -194,7 +194,11 @@ def _family(path: Path, file: WeightFile, conv_in: Tensor) -> str:
 
 
 def _lacks_geometry(path: Path, config: ModelConfig) -> bool:
-    """Whether all that a saved model's denoiser is not told is the warp's depth and confidence."""
+    """Whether all that a saved model's denoiser is not told is the warp's depth and confidence;
+    published ones never were.
+    """
+    if not (path / MODEL_CONFIG).is_file():
+        return False
     saved = _saved_config(path)
     return not saved.geometry and saved.octaves == config.octaves
 

@@ -56,6 +56,15 @@ def test_any_precision_trains_in_float32(
     assert torch.equal(model.unet.conv_in.weight, typed[_FIRST].float())
 
 
+def test_a_published_file_is_not_asked_what_our_folders_say(
+    state: dict[str, Tensor], tmp_path: Path
+) -> None:
+    """It has no configuration beside it, whatever the model's own wants to know of the start."""
+    torch.save({"state_dict": state}, tmp_path / "zeronvs.ckpt")
+    model = initial_model(replace(_config(tmp_path / "zeronvs.ckpt"), geometry=True))
+    assert torch.equal(model.unet.conv_in.weight, state[_FIRST])
+
+
 def test_averages_and_schedules_beside_the_weights_are_ignored(
     state: dict[str, Tensor], tmp_path: Path
 ) -> None:
