@@ -5,10 +5,13 @@ from dataclasses import fields, is_dataclass
 from types import UnionType
 from typing import get_args, get_origin, get_type_hints
 
+import hydra
 import pytest
 
+from extrap_train.cli import register_schemas, typed_config
 from extrap_train.config import TrainConfig
 from extrap_train.config.checks import BOUNDS
+from extrap_train.errors import InputError
 
 
 def _numbers(kind: type, prefix: str = "") -> Iterator[str]:
@@ -31,3 +34,12 @@ def _options() -> list[str]:
 @pytest.mark.parametrize("name", _options())
 def test_a_number_has_bounds(name: str) -> None:
     assert name in BOUNDS
+
+
+@pytest.mark.parametrize("precision", ["bf16-true", "16-true", "64-true"])
+def test_weights_stay_in_single_precision(precision: str) -> None:
+    register_schemas()
+    with hydra.initialize_config_module("conf", version_base="1.3"):
+        composed = hydra.compose("train", ["category=hydrant", f"trainer.precision={precision}"])
+    with pytest.raises(InputError, match="known: 32-true, bf16-mixed, 16-mixed"):
+        typed_config(composed)

@@ -19,7 +19,8 @@ from extrap_train.config.tree import dotted
 from extrap_train.errors import InputError
 
 _ACCELERATORS = ("auto", "cpu", "gpu", "cuda", "mps")
-_PRECISIONS = ("32-true", "bf16-mixed", "16-mixed", "bf16-true", "16-true", "64-true")
+_PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
+"""Weights stay in single precision: in half, an optimiser's small steps would be lost."""
 
 _PUBLISHED_STEPS = tuple(n for n in range(2, 501) if 1000 % n == 0)
 """Strides that go into the 1000 steps of the schedule without a rest."""

@@ -28,7 +28,7 @@ class TrainerConfig:
     power_averages: bool = False
     """Keep snapshots from which `task=average` makes averaged weights of any length afterwards."""
     precision: str = "bf16-mixed"
-    """Lightning's name of it: `bf16-mixed`, `32-true`, `16-mixed` …"""
+    """Lightning's name of it: `bf16-mixed`, `16-mixed` or `32-true`."""
     gradient_checkpointing: bool = False
     """Compute the denoiser's activations twice instead of keeping them: less memory, more time."""
     compile: bool = False
