@@ -15,7 +15,13 @@ from extrap_train.config.benchmark import (
     ScoringConfig,
     TableConfig,
 )
-from extrap_train.config.checks import require_published, required_file, sampler_for, validate
+from extrap_train.config.checks import (
+    require_published,
+    required_file,
+    sampler_for,
+    validate,
+    validate_model,
+)
 from extrap_train.config.commands import DataPrepConfig, TrainConfig
 from extrap_train.config.completion import CompletionConfig, ConfidenceConfig, SplatsConfig
 from extrap_train.config.data import (
@@ -105,4 +111,5 @@ __all__ = [
     "required_file",
     "sampler_for",
     "validate",
+    "validate_model",
 ]

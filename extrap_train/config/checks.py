@@ -123,7 +123,7 @@ BOUNDS |= {f"model.{name}": BOUNDS[name] for name in BOUNDS if name.startswith("
 
 def validate(config: TrainConfig | DataPrepConfig, tasks: tuple[str, ...]) -> None:
     """Check what types cannot say; raises InputError with option, value and remedy."""
-    _check_bounds(config)
+    _check_bounds(dotted(asdict(config)))
     _check_prep(config.prep)
     if isinstance(config.data, Co3dConfig) and not config.data.root:
         raise InputError("data=co3d needs the folder of the download: give data.root=FOLDER")
@@ -160,8 +160,8 @@ def required_file(path: str | None, option: str, content: str) -> str:
     return path
 
 
-def _check_bounds(config: TrainConfig | DataPrepConfig) -> None:
-    for name, value in dotted(asdict(config)).items():
+def _check_bounds(options: dict[str, Any]) -> None:
+    for name, value in options.items():
         least, greatest = BOUNDS.get(name, (-math.inf, math.inf))
         if not isinstance(value, int | float) or least <= value <= greatest:
             continue
@@ -180,18 +180,6 @@ def _check_prep(prep: PrepConfig) -> None:
 
 
 def _check_model(model: ModelConfig, prep: PrepConfig) -> None:
-    _check_one_of("model.prediction", model.prediction, ("epsilon", "v_prediction", "sample"))
-    _check_one_of("model.family", model.family, FAMILIES)
-    if model.residual and model.family == "zeronvs":
-        raise InputError(
-            "model.residual=true needs a warp, which model.family=zeronvs is not told: give "
-            "model.residual=false"
-        )
-    if model.geometry and model.family != "ours":
-        raise InputError(
-            f"model.geometry=true, but model.family={model.family} is told no depth of the warp: "
-            "leave it out"
-        )
     if model.references > 1 and model.family in NEAREST_ALONE:
         raise InputError(
             f"model.references={model.references}, but model.family={model.family} is told of the "
@@ -203,10 +191,30 @@ def _check_model(model: ModelConfig, prep: PrepConfig) -> None:
             f"{model.warp_scale} times model.image_size={model.image_size}: give "
             f"prep.image_size={model.warp_size}"
         )
+    _check_network(model)
+
+
+def validate_model(model: ModelConfig) -> None:
+    """Check what types cannot say of a model alone, as of one that was saved, like `validate`."""
+    _check_bounds(dotted({"model": asdict(model)}))
+    _check_network(model)
+    _check_sampler(model.sampler)
+
+
+def _check_network(model: ModelConfig) -> None:
+    _check_one_of("model.prediction", model.prediction, ("epsilon", "v_prediction", "sample"))
+    _check_one_of("model.family", model.family, FAMILIES)
+    if model.residual and model.family == "zeronvs":
+        raise InputError(
+            "model.residual=true needs a warp, which model.family=zeronvs is not told: give "
+            "model.residual=false"
+        )
     groups = model.unet.norm_groups
     odd = [width for width in model.unet.channels if width <= 0 or width % groups]
     if odd or not model.unet.channels:
         raise InputError(f"model.unet.channels={model.unet.channels}: need multiples of {groups}")
+    if model.vae is not None and not model.vae.channels:
+        raise InputError("model.vae.channels=[]: need a width a level")
     factor = model.patch if model.vae is None else 2 ** (len(model.vae.channels) - 1)
     coarsest = factor * 2 ** (len(model.unet.channels) - 1)
     if model.image_size % coarsest:

@@ -6,13 +6,16 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import torch
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from extrap_train.config import ClipConfig, ModelConfig, SamplerConfig, UNetConfig, VaeConfig
+from extrap_train.config import ModelConfig, validate_model
 from extrap_train.data.files import partial_beside, write_whole
 from extrap_train.diffusion.autoencoder import PixelPatches
 from extrap_train.diffusion.compact import compress, restore
@@ -148,15 +151,18 @@ def is_own(path: Path) -> bool:
 
 
 def _saved_config(folder: Path) -> ModelConfig:
-    inner = {"unet": UNetConfig, "vae": VaeConfig, "clip": ClipConfig, "sampler": SamplerConfig}
+    """Of the types and within the bounds that the command line's options have, too."""
+    file = folder / MODEL_CONFIG
     try:
-        saved = json.loads((folder / MODEL_CONFIG).read_text())
-        for name, kind in inner.items():
-            if saved.get(name) is not None:
-                saved[name] = kind(**saved[name])
-        return ModelConfig(**saved)
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError(f"{folder / MODEL_CONFIG}: no model of this project ({error})") from None
+        saved = json.loads(file.read_text())
+        typed: Any = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(ModelConfig), saved))
+        validate_model(typed)
+        return typed
+    except InputError as error:
+        raise InputError(f"{file}: no model of this project ({error})") from None
+    except (OSError, ValueError, TypeError, AttributeError, OmegaConfBaseException) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"{file}: no model of this project ({reason})") from None
 
 
 def load_weights(model: ExtrapolationModel, path: Path, option: str = "model.start") -> None:
@@ -172,7 +178,10 @@ def load_weights(model: ExtrapolationModel, path: Path, option: str = "model.sta
     read = _read_compact if is_compact(path) else read_published
     found = read(path, wanted, model.config, option)
     file, unet = found["unet"]
-    family = _family(path, file, unet["conv_in.weight"])
+    first = unet.get("conv_in.weight")
+    if first is None or first.ndim != 4:
+        raise file.refusal("has no convolution conv_in that the denoiser begins with")
+    family = _family(path, file, first)
     if family != model.config.family:
         _take_over(found, family, model)
     elif model.config.geometry and _lacks_geometry(path, model.config):

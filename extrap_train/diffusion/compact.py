@@ -9,7 +9,7 @@ import zlib
 from collections.abc import Mapping
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
 _LEVELS = 7
@@ -38,17 +38,23 @@ def compress(state: Mapping[str, Tensor], base: Mapping[str, Tensor]) -> dict[st
 def restore(
     tensors: Mapping[str, Tensor], base: Mapping[str, Tensor], shapes: Mapping[str, torch.Size]
 ) -> dict[str, Tensor]:
-    """What `compress` made its tensors from, as near as four bits come.
+    """What `compress` made its tensors from, as near as four bits come; those called in `shapes`.
 
     Names that neither hold are left out: whoever loads the result sees what is missing. Raises
-    ValueError for damaged bits.
+    ValueError for bits and scales that are no difference to the base's tensor.
     """
     state = {name: value for name, value in tensors.items() if name in shapes}
-    for name, shape in shapes.items():
+    for name in shapes:
         if name + _BITS not in tensors or name not in base:
             continue
-        packed = _inflated(tensors[name + _BITS], shape[0])
-        difference = dequantised(packed, tensors[name + _SCALE], shape[1:].numel())
+        shape = base[name].shape
+        if len(shape) < 2:
+            raise ValueError(f"{name}: is never kept as a difference")
+        packed = _inflated(name, tensors[name + _BITS], shape)
+        step = tensors.get(name + _SCALE)
+        if step is None or step.shape != shape[:1] or not step.is_floating_point():
+            raise ValueError(f"{name}: has no scale a channel")
+        difference = dequantised(packed, step, shape[1:].numel())
         state[name] = base[name].float().cpu() + difference.view(shape)
     return state
 
@@ -89,12 +95,21 @@ def _deflated(packed: UInt8[Tensor, "o m"]) -> UInt8[Tensor, " c"]:
     )
 
 
-def _inflated(bits: UInt8[Tensor, " c"], rows: int) -> UInt8[Tensor, "o m"]:
+def _inflated(name: str, bits: Shaped[Tensor, "..."], shape: torch.Size) -> UInt8[Tensor, "o m"]:
+    """Two values a byte for a tensor of this shape; never more memory than that, whatever `bits`
+    claims to hold.
+    """
+    size = shape[0] * -(-shape[1:].numel() // 2)
+    if bits.dtype != torch.uint8:
+        raise ValueError(f"{name}: its bits are {bits.dtype}, not bytes")
+    inflater = zlib.decompressobj()
     try:
-        plain = bytearray(zlib.decompress(bits.numpy().tobytes()))
+        plain = inflater.decompress(bits.numpy().tobytes(), size + 1)
     except zlib.error as error:
-        raise ValueError(str(error)) from None
-    return torch.frombuffer(plain, dtype=torch.uint8).view(rows, -1)
+        raise ValueError(f"{name}: {error}") from None
+    if len(plain) != size or not inflater.eof or inflater.unused_data:
+        raise ValueError(f"{name}: its bits are not the {size} bytes that its shape needs")
+    return torch.frombuffer(bytearray(plain), dtype=torch.uint8).view(shape[0], -1)
 
 
 def _is_packed(name: str, shape: torch.Size, base: Mapping[str, Tensor]) -> bool:

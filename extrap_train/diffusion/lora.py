@@ -22,6 +22,7 @@ from extrap_train.errors import InputError
 _ATTENTION = ["to_q", "to_k", "to_v", "to_out.0"]
 _CONVOLUTIONS = ["conv1", "conv2"]
 _WEIGHTS = "adapter_model.safetensors"
+_OPTIONS = "adapter_config.json"
 _BASE = "base.json"
 """Beside peft's files: which weights the adapter was trained upon."""
 
@@ -81,7 +82,7 @@ def load_adapter(model: ExtrapolationModel, folder: Path) -> peft.PeftModel:
     """Put a saved adapter upon the denoiser; InputError where it was trained upon other weights."""
     try:
         wanted = json.loads((folder / _BASE).read_text())["sha256"]
-        config = peft.PeftConfig.from_pretrained(str(folder))
+        config = _saved_options(json.loads((folder / _OPTIONS).read_text()))
         weights = load_file(folder / _WEIGHTS)
     except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
         reason = f"{type(error).__name__} {error}".splitlines()[0]
@@ -94,12 +95,27 @@ def load_adapter(model: ExtrapolationModel, folder: Path) -> peft.PeftModel:
             "then, or adapt these with task=scene"
         )
     adapter = peft.get_peft_model(model.unet, config)
-    found: Any = peft.set_peft_model_state_dict(adapter, weights)
-    missing = [key for key in found.missing_keys if ".lora_" in key]
-    if missing or found.unexpected_keys:
-        odd = [*missing, *found.unexpected_keys]
+    own = {name: x.shape for name, x in peft.get_peft_model_state_dict(adapter).items()}
+    found = {name: x.shape for name, x in weights.items()}
+    if odd := sorted(name for name in own | found if own.get(name) != found.get(name)):
+        adapter.unload()
         raise InputError(f"adapter={folder}: {len(odd)} tensors do not fit, first {odd[0]}")
+    peft.set_peft_model_state_dict(adapter, weights)
     return adapter
+
+
+def _saved_options(saved: dict[str, Any]) -> peft.LoraConfig:
+    """Of what `add_adapter` may have set alone: peft's other options name modules to import."""
+    targets, rank, alpha = saved["target_modules"], saved["r"], saved["lora_alpha"]
+    if saved["peft_type"] != "LORA":
+        raise ValueError(f"peft_type is {saved['peft_type']}, not LORA")
+    if not set(targets) or not set(targets) <= {*_ATTENTION, *_CONVOLUTIONS}:
+        raise ValueError(f"target_modules are {targets}")
+    if type(rank) is not int or rank < 1 or not isinstance(alpha, int | float):
+        raise ValueError(f"r is {rank} and lora_alpha {alpha}")
+    return peft.LoraConfig(
+        r=rank, lora_alpha=alpha, target_modules=list(targets), inference_mode=True
+    )
 
 
 def base_hash(unet: nn.Module) -> str:

@@ -1,6 +1,7 @@
 """A saved model is a diffusers folder, loads strictly, and says in one line what does not fit."""
 
 import errno
+import json
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -100,3 +101,42 @@ def test_a_full_disk_leaves_the_older_model(
 def test_an_unknown_start_lists_what_there_is(config: ModelConfig) -> None:
     with pytest.raises(InputError, match=r"model\.start=nothing"):
         initial_model(replace(config, start="nothing"))
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"family": "unknown"},
+        {"prediction": "epsilon"},  # at zero terminal SNR
+        {"patch": 0},
+        {"image_size": "large"},
+        {"image_size": 33},
+        {"references": None},
+        {"unet": {"channels": []}},
+        {"unet": {"widths": [16]}},
+        {"unet": 3},
+        {"vae": {"channels": []}},
+        {"sampler": {"solver": "euler"}},
+        {"sampler": {"steps": 0}},
+        {"colour": "red"},
+    ],
+)
+def test_a_saved_configuration_that_means_no_model_is_refused(
+    config: ModelConfig, tmp_path: Path, changed: dict[str, object]
+) -> None:
+    """Edited by hand, or of a version to come: one line that names the file."""
+    save_model(ExtrapolationModel(config), tmp_path / "model")
+    file = tmp_path / "model" / "extrapolation_model.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | changed))
+    with pytest.raises(InputError, match="no model of this project") as raised:
+        load_model(tmp_path / "model")
+    assert str(raised.value).startswith(f"{file}: ")
+    assert "\n" not in str(raised.value)
+
+
+def test_a_configuration_that_is_no_table_is_refused(config: ModelConfig, tmp_path: Path) -> None:
+    save_model(ExtrapolationModel(config), tmp_path / "model")
+    for text in ("[1]", "3", "null", "{", '"a"'):
+        (tmp_path / "model" / "extrapolation_model.json").write_text(text)
+        with pytest.raises(InputError, match="no model of this project"):
+            load_model(tmp_path / "model")

@@ -1,6 +1,9 @@
 """Four bits a weight: how near they come, that such a folder loads, and what is refused."""
 
 import json
+import tracemalloc
+import zlib
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -119,3 +122,62 @@ def test_a_damaged_or_shortened_file_is_refused(base: Path, tmp_path: Path) -> N
     save_file(tensors, path, about)
     with pytest.raises(InputError, match=r"1 missing \(conv_out\.weight\)"):
         load_model(tmp_path / "packed")
+
+
+_NAME = "unet.conv_out.weight"
+
+
+def _deflated(count: int) -> torch.Tensor:
+    return torch.frombuffer(bytearray(zlib.compress(bytes(count), 9)), dtype=torch.uint8)
+
+
+def _sizes(base: Path) -> tuple[int, int]:
+    weight = load_model(base).unet.conv_out.weight
+    return len(weight), -(-weight[0].numel() // 2)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda rows, n: {":bits": _deflated(rows * n + 1)}, "bits are not the"),
+        (lambda rows, n: {":bits": _deflated(rows * n - 1)}, "bits are not the"),
+        (lambda rows, n: {":bits": _deflated(rows * n * 2)}, "bits are not the"),
+        (lambda rows, n: {":bits": _deflated(200_000_000)}, "bits are not the"),
+        (lambda rows, n: {":bits": _deflated(rows * n)[:-3].clone()}, "bits are not the"),
+        (lambda rows, n: {":bits": torch.cat([_deflated(rows * n)] * 2)}, "bits are not the"),
+        (lambda rows, n: {":bits": _deflated(rows * n).float()}, "not bytes"),
+        (lambda rows, n: {":scale": None}, "no scale a channel"),
+        (lambda rows, n: {":scale": torch.ones(rows + 1)}, "no scale a channel"),
+        (lambda rows, n: {":scale": torch.ones(rows, dtype=torch.int32)}, "no scale a channel"),
+    ],
+)
+def test_what_is_no_difference_to_the_base_is_refused(
+    base: Path, tmp_path: Path, change: Callable, said: str
+) -> None:
+    save_compact(_trained(base), tmp_path / "packed")
+    _rewrite(tmp_path / "packed" / "difference.safetensors", _NAME, change(*_sizes(base)))
+    tracemalloc.start()
+    with pytest.raises(InputError, match=said) as raised:
+        load_model(tmp_path / "packed")
+    assert tracemalloc.get_traced_memory()[1] < 50e6, "bytes that the shape has no place for"
+    tracemalloc.stop()
+    assert "\n" not in str(raised.value)
+
+
+def test_a_difference_without_the_first_layer_is_refused(base: Path, tmp_path: Path) -> None:
+    save_compact(_trained(base), tmp_path / "packed")
+    file = tmp_path / "packed" / "difference.safetensors"
+    _rewrite(file, "unet.conv_in.weight", {":bits": None, ":scale": None})
+    with pytest.raises(InputError, match="no convolution conv_in"):
+        load_model(tmp_path / "packed")
+
+
+def _rewrite(file: Path, name: str, changed: dict[str, torch.Tensor | None]) -> None:
+    whole = file.read_bytes()
+    about = json.loads(whole[8 : 8 + int.from_bytes(whole[:8], "little")])["__metadata__"]
+    tensors = load_file(file)
+    for end, value in changed.items():
+        del tensors[name + end]
+        if value is not None:
+            tensors[name + end] = value
+    save_file(tensors, file, about)

@@ -1,5 +1,6 @@
 """An adapter changes what a model paints and never the model; it comes back as it was saved."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -96,6 +97,33 @@ def test_other_weights_and_other_folders_are_refused(config: ModelConfig, tmp_pa
     weights.write_bytes(weights.read_bytes()[:100])
     with pytest.raises(InputError, match="is no adapter folder of task=scene"):
         load_adapter(_model(config), tmp_path / "adapter")
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"r": 3}, "tensors do not fit"),
+        ({"r": 0}, "is no adapter folder"),
+        ({"r": "many"}, "is no adapter folder"),
+        ({"peft_type": "IA3"}, "peft_type is IA3, not LORA"),
+        ({"peft_type": "NONE"}, "peft_type is NONE, not LORA"),
+        ({"target_modules": ["conv_in"]}, "target_modules are"),
+        ({"target_modules": None}, "is no adapter folder"),
+        ({"target_modules": ["to_q"]}, "tensors do not fit"),
+    ],
+)
+def test_an_adapter_of_another_kind_is_refused_and_leaves_the_model_alone(
+    config: ModelConfig, batch: PairBatch, tmp_path: Path, changed: dict[str, Any], said: str
+) -> None:
+    save_adapter(_randomised(_model(config)), tmp_path / "adapter")
+    file = tmp_path / "adapter" / "adapter_config.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | changed))
+    model = _model(config)
+    names = list(model.state_dict())
+    with pytest.raises(InputError, match=said) as raised:
+        load_adapter(model, tmp_path / "adapter")
+    assert "\n" not in str(raised.value)
+    assert list(model.state_dict()) == names
 
 
 def _views(count: int) -> list[View]:
