@@ -12,9 +12,8 @@ from torch.nn import functional
 
 from extrap_train.config import MonocularConfig
 from extrap_train.depth import DepthMap, PointMaps, point_maps_of
-from extrap_train.depth.depth_range import convergence_point
 from extrap_train.depth.line_fit import robust_line
-from extrap_train.depth.neighbours import WIDEST_RAD, choose_neighbours
+from extrap_train.depth.neighbours import WIDEST_RAD, neighbours_of
 from extrap_train.errors import InputError
 from extrap_train.geometry.triangulation import triangulate
 from extrap_train.matching import Matcher
@@ -107,9 +106,7 @@ class MonocularDepth:
             return DepthMap(*torch.zeros_like(view.image[:2]))
 
     def _neighbours(self, views: Sequence[View]) -> list[list[int]]:
-        cameras = [view.camera for view in views]
-        center = convergence_point(cameras)
-        return choose_neighbours(cameras, center, self.config.neighbours, WIDEST_RAD)
+        return neighbours_of(views, self.config.neighbours, WIDEST_RAD)
 
     def _aligned(self, view: View, helpers: Sequence[View]) -> DepthMap:
         """NotAligned where too few points are found, or they are not nearer where it says so."""

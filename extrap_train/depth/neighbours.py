@@ -1,13 +1,15 @@
 """Which other views help to find a view's depth."""
 
 import math
+from collections.abc import Sequence
 from itertools import cycle
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrap_train.views import Camera
+from extrap_train.depth.depth_range import convergence_point
+from extrap_train.views import Camera, View
 
 NEAREST_RAD, FARTHEST_RAD = math.radians(6), math.radians(18)
 """Seen from the scene's centre: nearer and depth is vague, farther and surfaces look different."""
@@ -16,6 +18,14 @@ LEAST_RAD, LIMIT_RAD = math.radians(3), math.radians(45)
 
 WIDEST_RAD = math.radians(90)
 """Limit of what matchers and learned point maps bridge."""
+
+
+def neighbours_of(
+    views: Sequence[View], count: int, limit_rad: float = LIMIT_RAD
+) -> list[list[int]]:
+    """`choose_neighbours` of views that look at the point where their axes converge."""
+    cameras = [view.camera for view in views]
+    return choose_neighbours(cameras, convergence_point(cameras), count, limit_rad)
 
 
 def choose_neighbours(

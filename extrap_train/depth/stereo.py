@@ -11,7 +11,7 @@ from extrap_train.config import StereoConfig
 from extrap_train.depth import DepthMap, PointMaps, point_maps_of
 from extrap_train.depth.consistency import agreement, forward_backward_error
 from extrap_train.depth.depth_range import convergence_point, inverse_depth_range
-from extrap_train.depth.neighbours import choose_neighbours
+from extrap_train.depth.neighbours import neighbours_of
 from extrap_train.depth.plane_sweep import Estimate, sweep
 from extrap_train.depth.resample import resampled
 from extrap_train.errors import InputError
@@ -67,8 +67,7 @@ class PlaneSweepStereo:
 
     def neighbours(self, views: Sequence[View]) -> list[list[int]]:
         """Indices of the views that help each view, the most useful first."""
-        cameras = [view.camera for view in views]
-        return choose_neighbours(cameras, convergence_point(cameras), self.config.neighbours)
+        return neighbours_of(views, self.config.neighbours)
 
     def _maps(
         self, views: list[View], helpers: list[list[int]], wanted: Sequence[int]

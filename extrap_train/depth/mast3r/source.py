@@ -7,12 +7,11 @@ import torch
 
 from extrap_train.config import Mast3rConfig
 from extrap_train.depth import DepthMap, PointMaps, point_maps_of
-from extrap_train.depth.depth_range import convergence_point
 from extrap_train.depth.fusion import fused
 from extrap_train.depth.mast3r.network import Encoding, PointMapNetwork
 from extrap_train.depth.mast3r.posed import posed_depths
 from extrap_train.depth.mast3r.preparation import Fit, fit, network_input
-from extrap_train.depth.neighbours import WIDEST_RAD, choose_neighbours
+from extrap_train.depth.neighbours import WIDEST_RAD, neighbours_of
 from extrap_train.errors import InputError
 from extrap_train.views import Camera, View, combine
 
@@ -67,14 +66,15 @@ class Mast3rDepth:
 
         InputError if none of them makes a pair whose scale is known.
         """
-        helpers = self._neighbours([view, *neighbours])[0]
-        estimates = self._estimates([view, *neighbours], {(0, other) for other in helpers})[0]
-        if not estimates:
+        views = [view, *neighbours]
+        pairs = {(0, other) for other in self._neighbours(views)[0]}
+        found = self._fused(views, pairs, wanted={0})
+        if not found:
             raise InputError(
                 f"{view.name or 'a view'}: no other view shows enough of the same from another "
                 "place, which depth=mast3r needs; use depth=dataset or add photographs"
             )
-        return fused(estimates)
+        return found[0]
 
     def depth_maps(self, views: Sequence[View]) -> list[DepthMap]:
         """The depth of every view of a capture; 0, unknown, where no pair can be used."""
@@ -83,29 +83,41 @@ class Mast3rDepth:
             for i, others in enumerate(self._neighbours(views))
             for j in others
         }
-        estimates = self._estimates(views, pairs)
+        found = self._fused(views, pairs, wanted=set(range(len(views))))
         return [
-            fused(estimates[i]) if estimates[i] else DepthMap(*torch.zeros_like(view.image[:2]))
+            found[i] if i in found else DepthMap(*torch.zeros_like(view.image[:2]))
             for i, view in enumerate(views)
         ]
 
     def _neighbours(self, views: Sequence[View]) -> list[list[int]]:
-        cameras = [view.camera for view in views]
-        center = convergence_point(cameras)
-        return choose_neighbours(cameras, center, self.config.neighbours, WIDEST_RAD)
+        return neighbours_of(views, self.config.neighbours, WIDEST_RAD)
 
-    def _estimates(
-        self, views: Sequence[View], pairs: set[tuple[int, int]]
-    ) -> list[list[DepthMap]]:
-        """For every view what each of its pairs says; a view is encoded once for all of them."""
-        prepared = {i: self._prepare(views[i]) for i in sorted({i for pair in pairs for i in pair})}
-        estimates: list[list[DepthMap]] = [[] for _ in views]
-        for i, j in sorted(pairs):
-            found = self._pair(prepared[i], prepared[j])
-            if found is not None:
-                estimates[i].append(found[0])
-                estimates[j].append(found[1])
-        return estimates
+    def _fused(
+        self, views: Sequence[View], pairs: set[tuple[int, int]], wanted: set[int]
+    ) -> dict[int, DepthMap]:
+        """Each wanted view's depth from all that its pairs say, if they say any.
+
+        A view is encoded once, and it is fused and forgotten as soon as its last pair is done: of
+        a capture's many views only some neighbours' are in memory at a time.
+        """
+        last = {view: pair for pair in sorted(pairs) for view in pair}
+        prepared: dict[int, _Prepared] = {}
+        estimates: dict[int, list[DepthMap]] = {view: [] for view in last}
+        depths: dict[int, DepthMap] = {}
+        for pair in sorted(pairs):
+            for view in pair:
+                if view not in prepared:
+                    prepared[view] = self._prepare(views[view])
+            found = self._pair(*(prepared[view] for view in pair))
+            for place, view in enumerate(pair):
+                if found is not None and view in wanted:
+                    estimates[view].append(found[place])
+                if last[view] == pair:
+                    said = estimates.pop(view)
+                    del prepared[view]
+                    if said:
+                        depths[view] = fused(said)
+        return depths
 
     @torch.no_grad()
     def _prepare(self, view: View) -> _Prepared:

@@ -1,3 +1,6 @@
+import copy
+import weakref
+
 import pytest
 import torch
 from oracle import Oracle
@@ -7,6 +10,7 @@ from traced_scenes import SCENES, orbit_camera, render
 from extrap_train.config import Mast3rConfig
 from extrap_train.depth import DepthSource
 from extrap_train.depth.build import depth_source
+from extrap_train.depth.fusion import fused
 from extrap_train.depth.mast3r.preparation import fit
 from extrap_train.depth.mast3r.source import Mast3rDepth
 from extrap_train.errors import InputError
@@ -36,6 +40,36 @@ def test_depth_maps_of_a_capture_have_the_worlds_scale_and_one_encoding_a_view()
     for found, view in zip(source.depth_maps(views), views, strict=True):
         check(found, view)
     assert source.network.encoded == 4
+
+
+def test_a_view_is_forgotten_with_its_last_pair_and_the_depth_is_that_of_all_pairs(monkeypatch):
+    """All estimates at once, as they would lie in memory, against what is fused on the way."""
+    source, views = source_and_views(*range(0, 180, 15))
+    everything = {i: [] for i in range(len(views))}
+    alive, most = weakref.WeakSet(), []
+    prepare, pair = Mast3rDepth._prepare, Mast3rDepth._pair
+    places = {id(view): i for i, view in enumerate(views)}
+
+    def prepared(self, view):
+        made = prepare(self, view)
+        alive.add(made.encoding.tokens)
+        most.append(len(alive))
+        return made
+
+    def kept(self, first, second):
+        found = pair(self, first, second)
+        for one, depth in zip((first, second), found, strict=True):
+            everything[places[id(one.view)]].append(copy.deepcopy(depth))
+        return found
+
+    monkeypatch.setattr(Mast3rDepth, "_prepare", prepared)
+    monkeypatch.setattr(Mast3rDepth, "_pair", kept)
+    for i, found in enumerate(source.depth_maps(views)):
+        expected = fused(everything[i])
+        assert torch.equal(found.depth, expected.depth)
+        assert torch.equal(found.confidence, expected.confidence)
+    assert source.network.encoded == len(views)
+    assert max(most) <= 4
 
 
 def test_depth_map_of_one_view():
