@@ -46,18 +46,12 @@ class DenseFlow:
     confidence: Float[Tensor, "h w"]
     """In [0, 1]; 0 where the pixel is unknown, hidden, outside, or contradicted on the way back."""
 
-    def matches(self, stride: int = 1, least_confidence: float = 0.0) -> Matches:
-        """The pixels that are surer than `least_confidence`, of every `stride`-th row and column.
-
-        The lattice starts in its cells' middles, so that no side of the picture is preferred.
-        """
-        height, width = self.confidence.shape
-        grid = pixel_grid(height, width, self.confidence.device)
-        cells = (slice(stride // 2, None, stride), slice(stride // 2, None, stride))
-        confidence = self.confidence[cells]
-        sure = confidence > least_confidence
-        first = grid[cells][sure].to(self.first_to_second.dtype)
-        return Matches(first, first + self.first_to_second[cells][sure], confidence[sure])
+    def matches(self) -> Matches:
+        """Every pixel whose way is known, row by row."""
+        grid = pixel_grid(*self.confidence.shape, self.confidence.device)
+        known = self.confidence > 0
+        first = grid[known].to(self.first_to_second.dtype)
+        return Matches(first, first + self.first_to_second[known], self.confidence[known])
 
 
 @runtime_checkable
@@ -74,20 +68,6 @@ class Matcher(Protocol):
 
         `first_known` is False where `first` has a hole: no match starts there.
         """
-        ...
-
-
-@runtime_checkable
-class DenseMatcher(Matcher, Protocol):
-    """A matcher that knows every pixel's way."""
-
-    def flow(
-        self,
-        first: Float[Tensor, "3 h w"],
-        second: Float[Tensor, "3 h2 w2"],
-        first_known: Bool[Tensor, "h w"] | None = None,
-    ) -> DenseFlow:
-        """Where each pixel of `first` is in `second`, colours in [0, 1]."""
         ...
 
 

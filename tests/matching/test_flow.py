@@ -9,7 +9,7 @@ from two_views import line_distances
 from extrap_train.config import FlowMatcherConfig
 from extrap_train.data.co3d import read_category
 from extrap_train.geometry.cameras import pixel_grid
-from extrap_train.matching import DenseMatcher, Matches
+from extrap_train.matching import Matcher, Matches
 from extrap_train.matching.build import matcher
 
 FLOW = matcher(FlowMatcherConfig())
@@ -89,24 +89,25 @@ def test_a_picture_without_texture_has_no_matches():
     assert len(FLOW.match(flat, flat)) == 0
 
 
-def test_the_lattice_of_matches_is_centred_and_filtered():
+def test_matches_are_the_pixels_whose_way_is_known():
     motion = MOTIONS["shift"](64)
     flow = FLOW.flow(*motion.pictures((64, 64)))
-    matches = flow.matches(stride=8, least_confidence=0.5)
-    assert (matches.confidence > 0.5).all()
-    assert ((matches.first - 4.5) % 8 == 0).all()
+    matches = flow.matches()
+    assert len(matches) == (flow.confidence > 0).sum() < 64 * 64
     u, v = matches.first.floor().long().unbind(-1)
     torch.testing.assert_close(matches.first_to_second, flow.first_to_second[v, u])
+    torch.testing.assert_close(matches.confidence, flow.confidence[v, u])
 
 
 @pytest.mark.parametrize(("i", "j"), [(1, 2), (2, 3), (8, 9)])
 def test_neighbouring_photographs_of_the_apple(shared, i, j):
     frames = read_category(shared / "data" / "co3d", "apple")[0].frames
     first, second = (frames[k].load().resized(512, 288) for k in (i, j))
-    matches = FLOW.flow(first.image, second.image).matches(stride=4, least_confidence=0.5)
+    matches = FLOW.match(first.image, second.image)
+    matches = matches[matches.confidence > 0.5]
     pixels = (matches.first.numpy(), matches.second.numpy())
     error = line_distances(*pixels, first.camera, second.camera)
-    share = 16 * len(matches) / (512 * 288)
+    share = len(matches) / (512 * 288)
     print(f"{i} to {j}: {share:.0%} of the pixels, median {np.median(error):.2f} px")
     assert share > 0.4
     assert np.median(error) < 0.3
@@ -123,5 +124,5 @@ def test_any_size_gives_a_finite_flow(height, width, second_height, second_width
     assert ((flow.confidence >= 0) & (flow.confidence <= 1)).all()
 
 
-def test_it_is_a_dense_matcher():
-    assert isinstance(FLOW, DenseMatcher)
+def test_it_is_a_matcher():
+    assert isinstance(FLOW, Matcher)

@@ -1,8 +1,7 @@
-"""From tokens to a raw value per pixel: points, confidences and descriptors before activation."""
+"""From tokens to a raw value per pixel: points and confidences before activation."""
 
 from collections.abc import Sequence
 
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
@@ -113,26 +112,23 @@ class DensePrediction(nn.Module):
 
 
 class DensePointHead(nn.Module):
-    """DUSt3R's head: points and their confidence. MASt3R's adds descriptors with theirs."""
+    """DUSt3R's head: points and their confidence. MASt3R's has descriptors beside them, whose
+    weights are held and not used: depth is not made of them.
+    """
 
     def __init__(
         self, encoder_width: int, decoder_width: int, patch: int, descriptor_width: int | None
     ) -> None:
         super().__init__()
-        self.patch = patch
         self.dpt = DensePrediction([encoder_width, *3 * [decoder_width]])
         if descriptor_width is not None:
             out = (descriptor_width + 1) * patch**2
             self.head_local_features = Mlp(encoder_width + decoder_width, out)
 
-    def forward(self, layers: Sequence[Tokens], grid: tuple[int, int]) -> Float[Tensor, "b c h w"]:
+    def forward(self, layers: Sequence[Tokens], grid: tuple[int, int]) -> Float[Tensor, "b 4 h w"]:
         """`layers` are the encoder's tokens and those after every block of the decoder."""
         depth = len(layers) - 1
-        points = self.dpt([layers[i] for i in (0, depth // 2, depth * 3 // 4, depth)], grid)
-        if not hasattr(self, "head_local_features"):
-            return points
-        local = self.head_local_features(torch.cat([layers[0], layers[-1]], -1))
-        return torch.cat([points, _unpatched(local, grid, self.patch)], 1)
+        return self.dpt([layers[i] for i in (0, depth // 2, depth * 3 // 4, depth)], grid)
 
 
 class LinearPointHead(nn.Module):

@@ -31,7 +31,9 @@ class Architecture:
     patch: int = 16
     head: Head = "dense"
     descriptor_width: int | None = 24
-    """None for DUSt3R, which has no descriptors."""
+    """Of MASt3R's descriptors, which are part of the weights, without use here; None for DUSt3R,
+    which has none.
+    """
 
 
 @dataclass(frozen=True)
@@ -50,10 +52,6 @@ class Prediction:
     points: Float[Tensor, "b h w 3"]
     confidence: Float[Tensor, "b h w"]
     """From 1 (none) upwards."""
-    descriptors: Float[Tensor, "b h w d"] | None
-    """Unit length; alike where both pictures show the same."""
-    descriptor_confidence: Float[Tensor, "b h w"] | None
-    """From 0 upwards."""
 
 
 class _PatchEmbedding(nn.Module):
@@ -124,14 +122,9 @@ def _head(a: Architecture) -> nn.Module:
     return DensePointHead(a.encoder_width, a.decoder_width, a.patch, a.descriptor_width)
 
 
-def _activated(raw: Float[Tensor, "b c h w"]) -> Prediction:
-    """Points leave the origin exponentially; confidences are exponentials, too."""
+def _activated(raw: Float[Tensor, "b 4 h w"]) -> Prediction:
+    """Points leave the origin exponentially; the confidence is an exponential, too."""
     values = raw.permute(0, 2, 3, 1)
-    points, confidence = values[..., :3], 1 + values[..., 3].exp()
+    points, confidence = values[..., : POINT_CHANNELS - 1], 1 + values[..., -1].exp()
     distance = points.norm(dim=-1, keepdim=True)
-    points = points / distance.clamp_min(1e-8) * distance.expm1()
-    local = values[..., POINT_CHANNELS:]
-    if not local.shape[-1]:
-        return Prediction(points, confidence, None, None)
-    descriptors = local[..., :-1] / local[..., :-1].norm(dim=-1, keepdim=True)
-    return Prediction(points, confidence, descriptors, local[..., -1].exp())
+    return Prediction(points / distance.clamp_min(1e-8) * distance.expm1(), confidence)

@@ -25,7 +25,7 @@ def exact_pair(
         points = unproject(render(list(scene), camera).depth, camera)
         to_first = first.world_to_cam @ camera.cam_to_world
         moved = transform(to_first, points.flatten(0, 1)).view_as(points) / unit
-        maps.append(Prediction(moved[None], torch.full(moved.shape[:2], 5.0)[None], None, None))
+        maps.append(Prediction(moved[None], torch.full(moved.shape[:2], 5.0)[None]))
     return maps[0], maps[1]
 
 
