@@ -7,7 +7,7 @@ import os
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import torch.distributed as dist
 from lightning.pytorch.utilities import rank_zero_only
@@ -45,7 +45,7 @@ def is_first() -> bool:
 
     Known before the processes have met, from the launcher's variables, as Lightning reads them.
     """
-    return rank_zero_only.rank == 0
+    return cast(Any, rank_zero_only).rank == 0
 
 
 def announce(folder: Path, opening: Opening) -> None:

@@ -111,7 +111,7 @@ def _saved_options(saved: dict[str, Any]) -> peft.LoraConfig:
         raise ValueError(f"peft_type is {saved['peft_type']}, not LORA")
     if not set(targets) or not set(targets) <= {*_ATTENTION, *_CONVOLUTIONS}:
         raise ValueError(f"target_modules are {targets}")
-    if type(rank) is not int or rank < 1 or not isinstance(alpha, int | float):
+    if type(rank) is not int or type(alpha) is not int or rank < 1:
         raise ValueError(f"r is {rank} and lora_alpha {alpha}")
     return peft.LoraConfig(
         r=rank, lora_alpha=alpha, target_modules=list(targets), inference_mode=True

@@ -48,7 +48,8 @@ class DenseFlow:
 
     def matches(self) -> Matches:
         """Every pixel whose way is known, row by row."""
-        grid = pixel_grid(*self.confidence.shape, self.confidence.device)
+        height, width = self.confidence.shape
+        grid = pixel_grid(height, width, self.confidence.device)
         known = self.confidence > 0
         first = grid[known].to(self.first_to_second.dtype)
         return Matches(first, first + self.first_to_second[known], self.confidence[known])
