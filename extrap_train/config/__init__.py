@@ -15,13 +15,7 @@ from extrap_train.config.benchmark import (
     ScoringConfig,
     TableConfig,
 )
-from extrap_train.config.checks import (
-    require_published,
-    required_file,
-    sampler_for,
-    validate,
-    validate_model,
-)
+from extrap_train.config.checks import required_file, validate, validate_model
 from extrap_train.config.commands import DataPrepConfig, TrainConfig
 from extrap_train.config.completion import CompletionConfig, ConfidenceConfig, SplatsConfig
 from extrap_train.config.data import (
@@ -56,6 +50,7 @@ from extrap_train.config.model import (
     UNetConfig,
     VaeConfig,
 )
+from extrap_train.config.sampling import require_published, sampler_for
 from extrap_train.config.scene import LoraConfig, SceneOptions
 from extrap_train.config.training import TrainerConfig, ValidationConfig
 from extrap_train.config.tree import MISSING, dotted

@@ -7,23 +7,15 @@ from typing import Any
 
 from extrap_train.config.commands import DataPrepConfig, TrainConfig
 from extrap_train.config.data import Co3dConfig, PrepConfig
-from extrap_train.config.model import (
-    FAMILIES,
-    NEAREST_ALONE,
-    ModelConfig,
-    SamplerConfig,
-    SamplerOptions,
-)
+from extrap_train.config.model import FAMILIES, NEAREST_ALONE, ModelConfig, SamplerConfig
+from extrap_train.config.sampling import check_sampler, sampler_for
 from extrap_train.config.training import TrainerConfig
-from extrap_train.config.tree import dotted
+from extrap_train.config.tree import dotted, require_one_of
 from extrap_train.errors import InputError
 
 _ACCELERATORS = ("auto", "cpu", "gpu", "cuda", "mps")
 _PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
 """Weights stay in single precision: in half, an optimiser's small steps would be lost."""
-
-_PUBLISHED_STEPS = tuple(n for n in range(2, 501) if 1000 % n == 0)
-"""Strides that go into the 1000 steps of the schedule without a rest."""
 
 BOUNDS: dict[str, tuple[float, float]] = {
     "seed": (0, 2**30),
@@ -131,9 +123,9 @@ def validate(config: TrainConfig | DataPrepConfig, tasks: tuple[str, ...]) -> No
         _check_folder(config.data.root)
     _check_files(config)
     if isinstance(config, TrainConfig):
-        _check_one_of("task", config.task, tasks)
-        _check_one_of("trainer.precision", config.trainer.precision, _PRECISIONS)
-        _check_one_of("trainer.accelerator", config.trainer.accelerator, _ACCELERATORS)
+        require_one_of("task", config.task, tasks)
+        require_one_of("trainer.precision", config.trainer.precision, _PRECISIONS)
+        require_one_of("trainer.accelerator", config.trainer.accelerator, _ACCELERATORS)
         _check_intervals(config.trainer)
         _check_model(config.model, config.prep)
         _check_groups(config)
@@ -171,7 +163,7 @@ def _check_bounds(options: dict[str, Any]) -> None:
 
 
 def _check_prep(prep: PrepConfig) -> None:
-    _check_one_of("prep.full_circle", prep.full_circle, ("require", "prefer", "ignore"))
+    require_one_of("prep.full_circle", prep.full_circle, ("require", "prefer", "ignore"))
     if not 0 <= prep.min_pair_angle_deg < prep.max_pair_angle_deg <= 90:
         raise InputError(
             f"prep.min_pair_angle_deg={prep.min_pair_angle_deg} and "
@@ -180,6 +172,11 @@ def _check_prep(prep: PrepConfig) -> None:
 
 
 def _check_model(model: ModelConfig, prep: PrepConfig) -> None:
+    if model.geometry and model.family != "ours":
+        raise InputError(
+            f"model.geometry=true, but model.family={model.family} is told no depth of the warp: "
+            "leave it out"
+        )
     if model.references > 1 and model.family in NEAREST_ALONE:
         raise InputError(
             f"model.references={model.references}, but model.family={model.family} is told of the "
@@ -198,12 +195,12 @@ def validate_model(model: ModelConfig) -> None:
     """Check what types cannot say of a model alone, as of one that was saved, like `validate`."""
     _check_bounds(dotted({"model": asdict(model)}))
     _check_network(model)
-    _check_sampler(model.sampler)
+    check_sampler(model.sampler)
 
 
 def _check_network(model: ModelConfig) -> None:
-    _check_one_of("model.prediction", model.prediction, ("epsilon", "v_prediction", "sample"))
-    _check_one_of("model.family", model.family, FAMILIES)
+    require_one_of("model.prediction", model.prediction, ("epsilon", "v_prediction", "sample"))
+    require_one_of("model.family", model.family, FAMILIES)
     if model.residual and model.family == "zeronvs":
         raise InputError(
             "model.residual=true needs a warp, which model.family=zeronvs is not told: give "
@@ -255,53 +252,7 @@ def _check_sampler_of(config: TrainConfig) -> None:
     if config.weights is None:
         sampler_for(config.sampler, config.model)
     else:
-        _check_sampler(config.sampler.over(SamplerConfig()))
-
-
-def sampler_for(options: SamplerOptions, model: ModelConfig) -> SamplerConfig:
-    """How a model's views are sampled: as it recommends, but for what the options say.
-
-    Raises InputError where the two do not go together.
-    """
-    sampler = options.over(model.sampler)
-    _check_sampler(sampler)
-    if sampler.compat is not None:
-        require_published(sampler, model.prediction, zero_terminal_snr=model.zero_terminal_snr)
-    return sampler
-
-
-def require_published(sampler: SamplerConfig, prediction: str, *, zero_terminal_snr: bool) -> None:
-    """InputError where sampling as ZeroNVS and MegaScenes did (`compat`) says nothing of a model,
-    or of a number of steps that they could not take.
-    """
-    option = f"sampler.compat={sampler.compat}"
-    if prediction != "epsilon" or zero_terminal_snr:
-        raise InputError(
-            f"{option} samples as models were published that predict the noise, without zero "
-            f"terminal SNR; this one predicts `{prediction}`: leave it out"
-        )
-    if sampler.steps not in _PUBLISHED_STEPS:
-        raise InputError(
-            f"{option} with sampler.steps={sampler.steps}: the published spacing needs one of "
-            f"{', '.join(map(str, _PUBLISHED_STEPS))}, of which it leaves out the noisiest"
-        )
-
-
-def _check_sampler(sampler: SamplerConfig) -> None:
-    _check_one_of("sampler.solver", sampler.solver, ("ddim", "dpmpp", "unipc"))
-    if sampler.compat is not None:
-        _check_one_of("sampler.compat", sampler.compat, ("megascenes",))
-    if sampler.solver != "ddim" and (sampler.eta > 0 or sampler.compat):
-        raise InputError(
-            f"sampler.solver={sampler.solver} is deterministic and none of the published runs: "
-            "sampler.eta and sampler.compat need sampler.solver=ddim; without them, sampler.eta=0"
-        )
-    interval = sampler.guidance_interval
-    if len(interval) != 2 or not 0 <= interval[0] <= interval[1] <= 1:
-        raise InputError(
-            f"sampler.guidance_interval={interval}: need [lowest,highest] with "
-            "0 ≤ lowest ≤ highest ≤ 1"
-        )
+        check_sampler(config.sampler.over(SamplerConfig()))
 
 
 def _check_completion(config: TrainConfig) -> None:
@@ -311,17 +262,12 @@ def _check_completion(config: TrainConfig) -> None:
         raise InputError(
             "one photograph does not show where its surfaces are; give at least two (inputs=3)"
         )
-    _check_one_of("complete.draw", complete.draw, ("one_sided", "spread"))
-    _check_one_of("complete.poses", complete.poses, ("orbit", "capture"))
-    _check_one_of("complete.generator", complete.generator, ("model", "exact"))
+    require_one_of("complete.draw", complete.draw, ("one_sided", "spread"))
+    require_one_of("complete.poses", complete.poses, ("orbit", "capture"))
+    require_one_of("complete.generator", complete.generator, ("model", "exact"))
 
 
 def _check_folder(root: str) -> None:
     """Before anything is written: a wrong root must not leave a run behind."""
     if not Path(root).is_dir():
         raise InputError(f"data.root={root}: no such folder; give the folder of the download")
-
-
-def _check_one_of(name: str, value: str, known: tuple[str, ...]) -> None:
-    if value not in known:
-        raise InputError(f"{name}={value} is unknown; known: {', '.join(known)}")

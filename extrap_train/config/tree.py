@@ -2,6 +2,8 @@
 
 from typing import Any
 
+from extrap_train.errors import InputError
+
 MISSING: Any = "???"  # OmegaConf's mark for "must be given"
 
 
@@ -14,3 +16,9 @@ def dotted(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
         else:
             items[prefix + key] = value
     return items
+
+
+def require_one_of(name: str, value: str, known: tuple[str, ...]) -> None:
+    """InputError unless the option's value is one of the known words."""
+    if value not in known:
+        raise InputError(f"{name}={value} is unknown; known: {', '.join(known)}")
