@@ -57,7 +57,7 @@ def split_sequences(sequences: Sequence[str], test: Collection[str] | int) -> Sp
         if len(names) == 1:
             lone += names
         elif isinstance(test, int):
-            tested += sorted(names, key=_hash)[: min(test, len(names) // 2)]
+            tested += sorted(names, key=by_hash)[: min(test, len(names) // 2)]
         else:
             tested += _named(category, names, test)
     train = tuple(s for s in sorted(sequences) if s not in {*tested, *lone})
@@ -84,5 +84,6 @@ def _named(category: str, names: list[str], test: Collection[str]) -> list[str]:
     return chosen
 
 
-def _hash(name: str) -> str:
+def by_hash(name: str) -> str:
+    """The order in which sequences, as `category/name`, become test sequences."""
     return hashlib.sha256(name.encode()).hexdigest()
