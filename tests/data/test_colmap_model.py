@@ -215,5 +215,5 @@ def test_images_without_lines_of_points_are_not_lost(tmp_path):
     file = tmp_path / "images.txt"
     images = [line for line in file.read_text().splitlines() if line.endswith(".png")]
     file.write_text("\n".join(images) + "\n")
-    with pytest.raises(InputError, match="line 2 is an image where the points .* export"):
+    with pytest.raises(InputError, match=r"line 2 is an image where the points .* export"):
         read_text_images(file)
