@@ -13,6 +13,8 @@ from extrap_train.errors import InputError
 
 TRAINED_ON = "data.json"
 """In a run's folder."""
+START_OVER = "choose another run=NAME, or resume=false to start over"
+"""What to do with a run that cannot go on."""
 
 
 @dataclass(frozen=True)
@@ -87,13 +89,15 @@ class TrainedOn:
         content = {name: asdict(data) for name, data in self.categories.items()}
         write_whole(file, (json.dumps(content, indent=1) + "\n").encode())
 
-    def require_same(self, file: Path) -> None:
-        """InputError unless a run that is to go on was trained on the same, as `file` says."""
-        remedy = "choose another run=NAME, or resume=false to start over"
+    def require_same(self, file: Path, otherwise: str = START_OVER) -> None:
+        """InputError unless a run was trained on the same, as `file` says.
+
+        `otherwise` is what remains to be done where the data cannot be put back.
+        """
         if not file.is_file():
             raise InputError(
                 f"{file.parent}: was begun before runs noted what they are trained on ({file.name} "
-                f"is missing), so nobody can tell whether the data are still the same: {remedy}"
+                f"is missing), so nobody can tell whether the data are still the same: {otherwise}"
             )
         before = TrainedOn.read(file).categories
         changed = [
@@ -104,7 +108,7 @@ class TrainedOn:
         if changed:
             raise InputError(
                 f"{file.parent}: its data have changed since it was begun: {', '.join(changed)}; "
-                f"put them back as they were, or {remedy}"
+                f"put them and their options back as they were, or {otherwise}"
             )
 
 

@@ -1,13 +1,14 @@
 """A trained model measured on the held-out views, as its training was."""
 
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import lightning
 from rich.console import Console
 
 from extrap_train.config import TrainConfig
+from extrap_train.data.store import PreparedData
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.metrics import lpips_or_reason
@@ -15,9 +16,30 @@ from extrap_train.runs import RunFolder, provenance
 from extrap_train.tasks.category import quieten_lightning
 from extrap_train.tasks.results import Results, write_results
 from extrap_train.tasks.training_data import data_module, prepared_data, validation_names
+from extrap_train.trained_on import TrainedOn
 
 
-def measure(model: ExtrapolationModel, steps: int, config: TrainConfig, folder: RunFolder) -> None:
+@dataclass(frozen=True)
+class RunData:
+    """The data of a finished run, whose held-out views its model has never seen."""
+
+    prepared: list[PreparedData]
+    seconds: float
+    """To prepare them."""
+
+    @classmethod
+    def of(cls, trained: RunFolder, config: TrainConfig) -> "RunData":
+        """InputError where the options and what lies there today are not what it was trained on."""
+        started = time.perf_counter()
+        prepared = prepared_data(config)
+        today = TrainedOn.of(config.category.members, prepared)
+        today.require_same(trained.data, "measure another run=NAME, or train one anew")
+        return cls(prepared, time.perf_counter() - started)
+
+
+def measure(
+    model: ExtrapolationModel, steps: int, config: TrainConfig, data: RunData, folder: RunFolder
+) -> None:
     """Write metrics, pictures and `summary.json` of a model that was trained for `steps`.
 
     Views are sampled as the model recommends, but for what `config.sampler` says, and in the
@@ -25,21 +47,17 @@ def measure(model: ExtrapolationModel, steps: int, config: TrainConfig, folder: 
     """
     quieten_lightning()
     distance, missing = lpips_or_reason(config.validation.lpips_weights)
-    started = time.perf_counter()
-    prepared = prepared_data(config)
-    seconds = {"prepare": time.perf_counter() - started}
-    data = data_module(replace(config, model=model.config), prepared)
-    validation = CategoryTraining(model, config, validation_names(data), distance)
-    _validator(config).validate(validation, data, verbose=False)
-    seconds["validate"] = validation.validation_seconds
+    pairs = data_module(replace(config, model=model.config), data.prepared)
+    validation = CategoryTraining(model, config, validation_names(pairs), distance)
+    _validator(config).validate(validation, pairs, verbose=False)
     results = Results(
         scores=validation.scores(),
         shown=validation.pictures(),
         missing=missing,
-        seconds=seconds,
+        seconds={"prepare": data.seconds, "validate": validation.validation_seconds},
         steps=steps,
         parameters=sum(p.numel() for p in model.parameters()),
-        provenance=provenance(config, {d.folder.name: d.manifest["key"] for d in prepared}),
+        provenance=provenance(config, {d.folder.name: d.manifest["key"] for d in data.prepared}),
     )
     write_results(results, config, folder, Console())
 

@@ -1,0 +1,81 @@
+"""A finished run is measured on the data that it was trained on, or not at all."""
+
+import json
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from orbits import capture, even, ring
+
+from data_prep.build import prepare
+from extrap_train.config import (
+    CategoryConfig,
+    Co3dConfig,
+    DatasetDepthConfig,
+    FlowMatcherConfig,
+    ModelConfig,
+    PrepConfig,
+    TrainConfig,
+)
+from extrap_train.data.store import PreparedData
+from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.errors import InputError
+from extrap_train.runs import RunFolder
+from extrap_train.tasks import average, validate
+from extrap_train.trained_on import TrainedOn
+
+
+def _prepared(folder: Path, test_names: set[str]) -> PreparedData:
+    return prepare(
+        [capture(ring(even(24)), f"{index:04d}") for index in range(3)],
+        DatasetDepth(),
+        PrepConfig(image_size=16),
+        test_names=test_names,
+        folder=folder,
+        progress=False,
+        source={"name": "co3d"},
+    )
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunFolder:
+    """Finished, as far as its folder says; its model is not needed to refuse to measure it."""
+    run = RunFolder(tmp_path / "out/train/cup/small/mine")
+    run.path.mkdir(parents=True)
+    run.summary.write_text(json.dumps({"steps": 3}))
+    TrainedOn.of(["cup"], [_prepared(tmp_path / "cup", {"0000"})]).write(run.data)
+    return run
+
+
+@pytest.fixture
+def config(tmp_path: Path, run: RunFolder, monkeypatch: pytest.MonkeyPatch) -> TrainConfig:
+    """Of a command for which another sequence is held out today."""
+    today = [_prepared(tmp_path / "today", {"0001"})]
+    monkeypatch.setattr("extrap_train.tasks.measure.prepared_data", lambda config: today)
+    return TrainConfig(
+        category=CategoryConfig("cup", ["cup"]),
+        data=Co3dConfig(root=str(tmp_path)),
+        depth=DatasetDepthConfig(),
+        matcher=FlowMatcherConfig(),
+        model=ModelConfig(name="small"),
+        output=str(tmp_path / "out"),
+        run="mine",
+    )
+
+
+@pytest.mark.parametrize("task", [validate, average])
+def test_a_run_that_has_seen_what_is_held_out_today_is_not_measured(
+    task: ModuleType, run: RunFolder, config: TrainConfig
+) -> None:
+    before = sorted(run.path.rglob("*"))
+    with pytest.raises(InputError, match=r"cup \(another split, 2 .* 0000\).* or measure another"):
+        task.run(config)
+    assert sorted(run.path.rglob("*")) == before
+
+
+def test_a_run_that_does_not_say_what_it_has_seen_is_not_measured(
+    run: RunFolder, config: TrainConfig
+) -> None:
+    run.data.unlink()
+    with pytest.raises(InputError, match=r"begun before runs noted .* train one anew"):
+        validate.run(config)
