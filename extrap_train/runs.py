@@ -36,7 +36,7 @@ machine goes about the same mathematics, and what other tasks read. What the mod
 sample with is part of the run as far as it is used, under `sampler`.
 """
 
-_ADDED = {"model.joint_views": 1}
+_ADDED = {"model.joint_views": 1, "data.set_list": None}
 """Options that came later, with the value that leaves all as it was: runs keep their names."""
 
 _LATEST = "latest"

@@ -141,3 +141,10 @@ def test_an_option_that_changes_nothing_renames_no_run(config: TrainConfig) -> N
     open_run(replace(config, run="mine"))
     with pytest.raises(InputError, match=r"model\.joint_views \(was 1, now 2\)"):
         open_run(replace(together, run="mine"))
+
+
+def test_a_download_without_a_set_list_has_the_run_it_had(config: TrainConfig) -> None:
+    download = Co3dConfig(root="co3d")
+    assert open_run(replace(config, data=download)).path.name == "seed0-8e6e01a4"
+    divided = replace(download, set_list="fewview_dev")
+    assert open_run(replace(config, data=divided)) != open_run(replace(config, data=download))

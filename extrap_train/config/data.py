@@ -49,6 +49,8 @@ class Co3dConfig(DataConfig):
     name: str = "co3d"
     test_sequences: int = 5
     """Drawn by a hash of the sequence's name; a lone sequence holds out frames instead."""
+    set_list: str | None = None
+    """CO3D's own division instead, as `fewview_dev`: its train and test sequences, no others."""
 
 
 @dataclass

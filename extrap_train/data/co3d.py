@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
 
 from extrap_train.data.annotations import (
     FrameAnnotation,
@@ -20,10 +19,7 @@ from extrap_train.data.annotations import (
     read_sequence_annotations,
 )
 from extrap_train.data.co3d_frames import Co3dFrames
-from extrap_train.data.files import check_relative
-from extrap_train.data.json_files import read_json
 from extrap_train.data.sequences import Sequence
-from extrap_train.data.validation import require_dict
 from extrap_train.errors import InputError, did_you_mean
 
 FRAME_ANNOTATIONS = "frame_annotations.jgz"
@@ -33,14 +29,6 @@ _ENTRIES_AT_A_TIME = 4096
 """Parsed JSON takes twenty times the room of what is kept of it."""
 
 log = logging.getLogger(__name__)
-
-
-class FrameId(NamedTuple):
-    """An entry of a set list."""
-
-    sequence: str
-    number: int
-    path: str
 
 
 def list_categories(root: Path) -> list[str]:
@@ -116,26 +104,6 @@ def read_sequence(root: Path, category: str, name: str) -> Sequence:
             f"{root / category}: has no sequence {name!r}; {did_you_mean(name, sequences)}"
         )
     return sequences[name]
-
-
-def read_set_list(root: Path, category: str, name: str) -> dict[str, list[FrameId]]:
-    """The subsets (`train`, `val`, `test`) of a set list, e.g. `manyview_dev_0`."""
-    file = root / category / "set_lists" / f"set_lists_{check_relative(name, root)}.json"
-    content = require_dict(read_json(file), "an object with a list per subset", file)
-    try:
-        return {
-            subset: [
-                FrameId(str(sequence), int(number), check_relative(path, file))
-                for sequence, number, path in entries
-            ]
-            for subset, entries in content.items()
-        }
-    except (TypeError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(
-            f"{file}: entries must be [sequence, frame number, path] ({error}); check the file"
-        ) from None
 
 
 def _sequence(

@@ -30,6 +30,7 @@ from extrap_train.config import (
 )
 from extrap_train.data.co3d import read_category
 from extrap_train.data.sequences import Sequence
+from extrap_train.data.set_lists import read_sequence_split
 from extrap_train.data.store import PreparedData
 from extrap_train.jobs import Launcher
 from extrap_train.jobs.build import open_launcher
@@ -64,7 +65,7 @@ def prepare_category(
     correction = asdict(how) if how else None
     frames_of = [category, _source(data), asdict(depth), prep.image_size]
     pairs_of = [*frames_of, pair_options(prep), correction]
-    all_of = [category, asdict(data), asdict(depth), asdict(prep), correction]
+    all_of = [category, _said(data), asdict(depth), asdict(prep), correction]
     frames, pairs, folder = (
         output / kind / f"{category}-{_digest(made_of)}"
         for kind, made_of in (("frames", frames_of), ("pairs", pairs_of), ("data", all_of))
@@ -120,7 +121,12 @@ def _sequences(
         return sequences, {f"{i:04d}" for i in range(data.test_sequences)}
     assert isinstance(data, Co3dConfig)
     assert data.root is not None
-    return read_category(Path(data.root), category), data.test_sequences
+    root = Path(data.root)
+    sequences = read_category(root, category)
+    if data.set_list is None:
+        return sequences, data.test_sequences
+    split = read_sequence_split(root, category, data.set_list)
+    return [s for s in sequences if s.name in split.train | split.test], set(split.test)
 
 
 def _placed(options: Options) -> Options:
@@ -136,10 +142,15 @@ def _placed(options: Options) -> Options:
     return replace(options, **placed)
 
 
+def _said(data: DataConfig) -> dict[str, Any]:
+    """The options without one that came later and is not given: preparations keep their names."""
+    return {k: value for k, value in asdict(data).items() if (k, value) != ("set_list", None)}
+
+
 def _source(data: DataConfig) -> dict[str, Any]:
-    """What a photograph depends on: not on how many sequences are for what."""
-    counts = ("test_sequences", "train_sequences")
-    return {name: value for name, value in asdict(data).items() if name not in counts}
+    """What a photograph depends on: not on which sequences are for what."""
+    split = ("test_sequences", "train_sequences", "set_list")
+    return {name: value for name, value in asdict(data).items() if name not in split}
 
 
 def _digest(parts: list[Any]) -> str:

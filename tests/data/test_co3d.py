@@ -8,7 +8,7 @@ from PIL import Image
 from plyfile import PlyData
 
 from extrap_train.data import co3d
-from extrap_train.data.co3d import list_categories, read_category, read_sequence, read_set_list
+from extrap_train.data.co3d import list_categories, read_category, read_sequence
 from extrap_train.geometry.cameras import project
 
 
@@ -57,14 +57,6 @@ def test_the_same_views_give_the_same_bytes(tmp_path):
     for path in first:
         twin = tmp_path / "b" / path.relative_to(tmp_path / "a")
         assert path.read_bytes() == twin.read_bytes()
-
-
-def test_set_lists_name_frames_by_subset(root):
-    subsets = read_set_list(root, "cup", "manyview_dev_0")
-    assert {frame.sequence for frame in subsets["train"]} == {"one"}
-    assert {frame.sequence for frame in subsets["test"]} == {"two"}
-    assert subsets["val"] == []
-    assert subsets["train"][0] == ("one", 1, "cup/one/images/frame000001.jpg")
 
 
 def test_categories_are_the_folders_with_annotations(root):

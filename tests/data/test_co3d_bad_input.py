@@ -8,7 +8,7 @@ import pytest
 from captures import frame_entries, replace_frame_entries, write_capture
 from PIL import Image
 
-from extrap_train.data.co3d import read_category, read_sequence, read_set_list
+from extrap_train.data.co3d import read_category, read_sequence
 from extrap_train.data.json_files import GZIP_FLOOR_BYTES
 from extrap_train.errors import InputError
 
@@ -235,15 +235,6 @@ def test_an_image_that_is_listed_twice(root):
 
 def test_unknown_sequence_suggests_near_names(root):
     assert "'onne'; did you mean one?" in complaint(read_sequence, root, "cup", "onne")
-
-
-@pytest.mark.parametrize(
-    "content", [[], {"train": 3}, {"train": [["one", 1]]}, {"train": [["one", 1, "../x"]]}]
-)
-def test_set_lists_of_the_wrong_shape(root, content):
-    file = root / "cup" / "set_lists" / "set_lists_manyview_dev_0.json"
-    file.write_text(json.dumps(content))
-    assert file.name in complaint(read_set_list, root, "cup", "manyview_dev_0")
 
 
 @pytest.mark.parametrize("letter", [0xD800, 0xDCFF])

@@ -4,7 +4,8 @@ import numpy as np
 import torch
 from two_views import epipolar_distances
 
-from extrap_train.data.co3d import read_category, read_sequence, read_set_list
+from extrap_train.data.co3d import read_category, read_sequence
+from extrap_train.data.set_lists import read_set_list
 
 
 def test_apple_features_lie_on_their_epipolar_lines(shared):

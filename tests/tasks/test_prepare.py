@@ -1,0 +1,31 @@
+"""Which sequences a category is trained and tested on."""
+
+import json
+from pathlib import Path
+
+from captures import write_capture
+
+from extrap_train.config import Co3dConfig, DatasetDepthConfig, FlowMatcherConfig, PrepConfig
+from extrap_train.tasks.prepare import _said, prepare_category
+
+
+def test_a_set_list_says_what_is_trained_and_tested_on(tmp_path: Path) -> None:
+    write_capture(tmp_path, ("a", "b", "c", "d", "unlisted"), frames=12)
+    subsets = {"train": ["a", "c"], "val": [], "test": ["b", "d"]}
+    content = {k: [[name, 1, f"cup/{name}/1.jpg"] for name in v] for k, v in subsets.items()}
+    (tmp_path / "cup/set_lists/set_lists_fewview_dev.json").write_text(json.dumps(content))
+    prepared = prepare_category(
+        "cup",
+        Co3dConfig(root=str(tmp_path), test_sequences=1, set_list="fewview_dev"),
+        DatasetDepthConfig(),
+        PrepConfig(image_size=16, max_uses=2, correct=False),
+        output=tmp_path / "outputs",
+        workers=1,
+        matcher=FlowMatcherConfig(),
+    )
+    assert prepared.roles == {"cup/a": "train", "cup/b": "test", "cup/c": "train", "cup/d": "test"}
+
+
+def test_without_a_set_list_preparations_are_called_as_before_there_was_one() -> None:
+    assert _said(Co3dConfig(root="x")) == {"name": "co3d", "root": "x", "test_sequences": 5}
+    assert _said(Co3dConfig(root="x", set_list="dev"))["set_list"] == "dev"
