@@ -10,7 +10,7 @@ from benchmarks.methods.checks import check_range
 from benchmarks.methods.diffusion import Diffusion, Painted
 from benchmarks.methods.references import views_with_depth
 from extrap_train.config import LoraConfig
-from extrap_train.data.scene_pairs import ScenePairs
+from extrap_train.data.scene_pairs import adaptation_pairs
 from extrap_train.diffusion.adaptation import adapt
 from extrap_train.diffusion.lora import temporary_adapter
 from extrap_train.diffusion.model import ExtrapolationModel
@@ -18,7 +18,7 @@ from extrap_train.diffusion.model import ExtrapolationModel
 
 @dataclass(frozen=True)
 class AdaptedDiffusion(Diffusion):
-    """Trains an adapter on the N(N − 1) pairs of the inputs, and paints with it (METHOD §4).
+    """Trains an adapter on pairs made of the inputs, and paints with it (METHOD §4).
 
     The adapter is this scene's: the model is handed on as it was. Training is preprocessing and
     part of the time, which is spread over the scene's images as that of estimated depth is.
@@ -41,6 +41,9 @@ class AdaptedDiffusion(Diffusion):
         """Adapt, paint, and take the adapter off again."""
         views = [view.squared(model.config.warp_size) for view in views_with_depth(inputs)]
         options = LoraConfig(steps=self.lora_steps)
+        pairs = adaptation_pairs(
+            views, model.config.told_references, options.virtual_references, inputs.seed
+        )
         # One process of its own, also where a cluster runs the cell.
         alone = LightningEnvironment()
         device = next(model.parameters()).device.type
@@ -48,7 +51,7 @@ class AdaptedDiffusion(Diffusion):
             done = adapt(
                 model,
                 adapter,
-                ScenePairs(views, model.config.told_references),
+                pairs,
                 options,
                 self.sampler(model),
                 seconds=60 * self.lora_minutes,

@@ -72,6 +72,7 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "frames": (1, 10_000),
     "lora.learning_rate": (1e-9, 1),
     "lora.rank": (1, 1024),
+    "lora.virtual_references": (0, 1000),
     "lora.batch_size": (1, math.inf),
     "lora.steps": (1, math.inf),
     "lora.validate_every": (1, math.inf),
@@ -131,6 +132,11 @@ def validate(config: TrainConfig | DataPrepConfig, tasks: tuple[str, ...]) -> No
         _check_groups(config)
         _check_completion(config)
         _check_sampler_of(config)
+        if config.lora.virtual_references == 1:
+            raise InputError(
+                "lora.virtual_references=1: one of every input's is held out; give 2 or more, or 0 "
+                "for the inputs' own pairs"
+            )
 
 
 def _check_files(config: TrainConfig | DataPrepConfig) -> None:

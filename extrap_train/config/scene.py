@@ -8,15 +8,20 @@ class LoraConfig:
     """How a model is adapted to a scene (paper II-B, METHOD section 4)."""
 
     rank: int = 16
-    convolutions: bool = False
+    convolutions: bool = True
     """Adapt the denoiser's convolutions, too, not its attention projections alone."""
-    learning_rate: float = 3e-3
+    virtual_references: int = 8
+    """Beside each input view, warped from the inputs, that it is painted from in training; 0 trains
+    on the inputs' own N(N − 1) pairs.
+    """
+    learning_rate: float | None = None
+    """Null takes the model's own."""
     batch_size: int = 8
     steps: int = 5000
-    """Most steps; time or the held-out pair usually ends it sooner."""
-    validate_every: int = 10
+    """Most steps; time or what is held out usually ends it sooner."""
+    validate_every: int = 25
     patience: int = 8
-    """Validations on the held-out pair without a gain after which it ends."""
+    """Validations on what is held out without a gain after which it ends."""
 
 
 @dataclass

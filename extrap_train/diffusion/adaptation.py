@@ -1,27 +1,35 @@
-"""Training a scene's adapter within a time budget, ended early by a held-out pair."""
+"""Training a scene's adapter within a time budget, ended early by what is held out."""
 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import peft
 import torch
+from jaxtyping import Float, Int
 from lightning.fabric import Fabric
 from torch import Tensor
 
 from extrap_train.config import LoraConfig, SamplerConfig
 from extrap_train.data.module import with_warp
-from extrap_train.data.scene_pairs import ScenePairs
+from extrap_train.data.scene_pairs import AdaptationPairs
+from extrap_train.diffusion.conditioning import Conditioning
 from extrap_train.diffusion.loss import diffusion_loss, prediction_errors
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.schedule import solver_of
+from extrap_train.views import PairBatch, combine
 
+_LEVELS = 4
+"""Of noise, at most, at which what is held out is measured; a long schedule is taken in strides."""
 _DRAWS = 8
-"""Of noise, at every level at which the held-out pair is measured."""
+"""Of noise at every level, shared among the held-out pairs."""
 _WARMUP = 20
 """Steps until the full learning rate."""
-_AVERAGE_DECAY = 0.95
+_AVERAGE_DECAY = 0.98
+_CONDITION_DROPOUT = 0.05
+"""Where sampling is guided: the adapter changes the null condition's prediction, too."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +37,7 @@ class Adaptation:
     """How an adapter was trained."""
 
     losses: list[tuple[int, float]]
-    """(step, error on the held-out pair); the first is the model's without the adapter."""
+    """(step, error on what is held out); the first is the model's without the adapter."""
     best_step: int
     """The step whose weights were kept; 0 keeps the model as it was."""
     steps: int
@@ -41,7 +49,7 @@ class Adaptation:
 def adapt(
     model: ExtrapolationModel,
     adapter: peft.PeftModel,
-    pairs: ScenePairs,
+    pairs: AdaptationPairs,
     options: LoraConfig,
     sampler: SamplerConfig,
     *,
@@ -54,21 +62,26 @@ def adapt(
     """Train the adapter and leave its best weights upon the model.
 
     Candidates are moving averages: the base is one, and single steps away from it are noisier than
-    what they learn. The best has the least error on the held-out pair, measured with fixed noise at
-    the levels that the sampler steps through. `on_step` hears of every step and the share of the
+    what they learn. The best has the least error on the held-out pairs, measured with fixed noise
+    at levels that the sampler steps through. `on_step` hears of every step and the share of the
     budget that is spent. Steps are a function of the seed; how many depends on the clock.
     """
     started = clock()
     trained = [weight for weight in model.parameters() if weight.requires_grad]
-    optimizer = torch.optim.AdamW(trained, lr=options.learning_rate, weight_decay=0.0)
-    measure = _HeldOut(model, pairs, sampler, fabric)
+    rate = options.learning_rate or model.config.learning_rate
+    # Set up by Fabric: with fp16 its steps undo the loss's scale.
+    optimizer: Any = fabric.setup_optimizers(torch.optim.AdamW(trained, lr=rate, weight_decay=0.0))
+    measure = _HeldOut(model, pairs.held_out_batch(), options.batch_size, sampler, fabric)
+    dropout = _CONDITION_DROPOUT if _is_guided(sampler) else 0.0
     losses = [(0, measure())]
     average = _weights(adapter)
     best, best_step = _weights(adapter), 0
     step, ended = 0, "steps"
     while step < options.steps:
-        optimizer.param_groups[0]["lr"] = options.learning_rate * min(1.0, (step + 1) / _WARMUP)
-        _train_step(model, pairs, options, optimizer, seed, step, fabric)
+        optimizer.param_groups[0]["lr"] = rate * min(1.0, (step + 1) / _WARMUP)
+        rng = np.random.default_rng((seed, step))
+        batch = pairs.training_batch(options.batch_size, rng)
+        _train_step(model, batch, optimizer, int(rng.integers(2**31)), dropout, fabric)
         step += 1
         newest = _weights(adapter)
         for name, value in average.items():
@@ -92,47 +105,79 @@ def adapt(
     return Adaptation(losses, best_step, step, clock() - started, ended)
 
 
+def _is_guided(sampler: SamplerConfig) -> bool:
+    return sampler.guidance != 1 or sampler.guidance_far not in (None, 1)
+
+
 def _train_step(
     model: ExtrapolationModel,
-    pairs: ScenePairs,
-    options: LoraConfig,
+    batch: PairBatch,
     optimizer: torch.optim.Optimizer,
-    seed: int,
-    step: int,
+    noise_seed: int,
+    condition_dropout: float,
     fabric: Fabric,
 ) -> None:
-    rng = np.random.default_rng((seed, step))
-    batch = pairs.training_batch(options.batch_size, rng).to(fabric.device)
-    batch = with_warp(batch, model.config.image_size)
-    generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
+    batch = with_warp(batch.to(fabric.device), model.config.image_size)
+    generator = torch.Generator().manual_seed(noise_seed)
     with fabric.autocast():
-        loss = diffusion_loss(model, batch, generator, 0.0)
+        loss = diffusion_loss(model, batch, generator, condition_dropout)
     optimizer.zero_grad()
     fabric.backward(loss)
     optimizer.step()
 
 
 class _HeldOut:
-    """The error on the held-out pair."""
+    """The error on the held-out pairs, of which no more than a training batch is taken at once."""
 
     def __init__(
-        self, model: ExtrapolationModel, pairs: ScenePairs, sampler: SamplerConfig, fabric: Fabric
+        self,
+        model: ExtrapolationModel,
+        batch: PairBatch,
+        most_at_once: int,
+        sampler: SamplerConfig,
+        fabric: Fabric,
     ) -> None:
-        levels = solver_of(model.schedule, sampler).timesteps
         self.model, self.fabric = model, fabric
-        self.timestep = levels.repeat(_DRAWS).to(fabric.device)
-        batch = pairs.held_out_batch(len(self.timestep)).to(fabric.device)
-        self.batch = with_warp(batch, model.config.image_size)
+        levels = solver_of(model.schedule, sampler).timesteps
+        self.levels = levels[:: -(-len(levels) // _LEVELS)].to(fabric.device)
+        self.draws = -(-_DRAWS // len(batch.image))
+        places = torch.arange(len(batch.image)).split(most_at_once)
+        self.parts = [self._part(_chosen(batch, part)) for part in places]
+
+    @torch.no_grad()
+    def _part(self, batch: PairBatch) -> tuple[Tensor, Conditioning]:
+        batch = with_warp(batch.to(self.fabric.device), self.model.config.image_size)
+        with self.fabric.autocast():
+            conditioning = self.model.condition(batch)
+            return self.model.encode_target(batch.image, conditioning), conditioning
 
     @torch.no_grad()
     def __call__(self) -> float:
+        generator = torch.Generator().manual_seed(0)
+        errors = [
+            self._errors(target, conditioning, level, generator)
+            for target, conditioning in self.parts
+            for level in self.levels
+            for _ in range(self.draws)
+        ]
+        return float(torch.cat(errors).mean())
+
+    def _errors(
+        self,
+        target: Float[Tensor, "b z h w"],
+        conditioning: Conditioning,
+        level: Int[Tensor, ""],
+        generator: torch.Generator,
+    ) -> Float[Tensor, " b"]:
+        noise = torch.randn(target.shape, generator=generator).to(target)
         with self.fabric.autocast():
-            conditioning = self.model.condition(self.batch)
-            target = self.model.encode_target(self.batch.image, conditioning)
-            generator = torch.Generator().manual_seed(0)
-            noise = torch.randn(target.shape, generator=generator).to(target)
-            errors = prediction_errors(self.model, target, noise, self.timestep, conditioning)
-        return float(errors.mean())
+            return prediction_errors(
+                self.model, target, noise, level.expand(len(target)), conditioning
+            )
+
+
+def _chosen(batch: PairBatch, places: Int[Tensor, " n"]) -> PairBatch:
+    return combine([batch], lambda tensors: tensors[0][places])
 
 
 def _weights(adapter: peft.PeftModel) -> dict[str, Tensor]:

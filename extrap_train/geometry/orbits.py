@@ -3,6 +3,7 @@
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from extrap_train.geometry.viewpoints import camera_centers, directions_from, fit_orbit
 from extrap_train.views import Camera
@@ -35,6 +36,29 @@ def orbit_cameras(views: Camera, span_rad: float, count: int) -> Camera:
         _central_lens(views).expand(count, 3, 3).clone(),
         views.height,
         views.width,
+    )
+
+
+def turned_cameras(
+    camera: Camera,
+    pivot: Float[np.ndarray, "3"],
+    axis: Float[np.ndarray, "3"],
+    angles_rad: Float[np.ndarray, " n"],
+) -> Camera:
+    """A camera carried around the axis (unit length) through the pivot, once for every angle.
+
+    Right-handed: seen from the axis's tip, a positive angle is counter-clockwise. What the camera
+    sees of the pivot, its distance and its place in the image, stays.
+    """
+    turns = np.tile(np.eye(4), (len(angles_rad), 1, 1))
+    turns[:, :3, :3] = Rotation.from_rotvec(angles_rad[:, None] * axis).as_matrix()
+    turns[:, :3, 3] = pivot - turns[:, :3, :3] @ pivot
+    cam_to_world = turns @ camera.cam_to_world.double().numpy(force=True)
+    return Camera(
+        torch.from_numpy(np.linalg.inv(cam_to_world)).to(camera.world_to_cam),
+        camera.intrinsics.expand(len(angles_rad), 3, 3).clone(),
+        camera.height,
+        camera.width,
     )
 
 

@@ -68,6 +68,13 @@ def facing(
     return cosine > np.cos(within_rad)
 
 
+def common_center(cameras: Camera) -> Float[np.ndarray, "3"] | None:
+    """The scene's centre if there are two cameras or more and all look at it, else None."""
+    center = scene_center(cameras)
+    look_at_it = len(cameras.world_to_cam) > 1 and facing(cameras, center, _LOOKS_AT_RAD).all()
+    return center if look_at_it else None
+
+
 def pairwise_angles(cameras: Camera, center: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n n"]:
     """Angles in [0, π] between viewing directions as seen from the scene's centre (METHOD §6)."""
     directions = directions_from(cameras, center)
@@ -107,8 +114,8 @@ def references_by_nearness(references: Camera, queries: Camera) -> Int[np.ndarra
     Nearness is the angle between viewing directions at the point that the references look at;
     where they have none in common (one camera, parallel axes), the distance between positions.
     """
-    center = scene_center(references)
-    if len(references.world_to_cam) > 1 and facing(references, center, _LOOKS_AT_RAD).all():
+    center = common_center(references)
+    if center is not None:
         cosines = directions_from(queries, center) @ directions_from(references, center).T
         farness = np.arccos(np.clip(cosines, -1.0, 1.0))
     else:

@@ -17,7 +17,7 @@ from data_prep.views import target_views
 from extrap_train.config import SamplerConfig, TrainConfig, sampler_for
 from extrap_train.data.files import write_whole
 from extrap_train.data.module import spread
-from extrap_train.data.scene_pairs import ScenePairs
+from extrap_train.data.scene_pairs import AdaptationPairs, adaptation_pairs
 from extrap_train.diffusion.adaptation import Adaptation, adapt
 from extrap_train.diffusion.evaluation import score_images, summarise
 from extrap_train.diffusion.generator import DiffusionGenerator, GeneratedViews
@@ -44,7 +44,9 @@ def run(config: TrainConfig) -> Path:
     fabric = fabric_of(config)
     model = trained_model(config).to(fabric.device)
     inputs = open_inputs(config, model.config.warp_size)
-    pairs = ScenePairs(inputs.views, model.config.told_references)
+    pairs = adaptation_pairs(
+        inputs.views, model.config.told_references, config.lora.virtual_references, config.seed
+    )
     folder = Path(config.output) / "scene" / inputs.label
     sampler = sampler_for(config.sampler, model.config)
     targets = _targets(config, inputs, model)
@@ -180,7 +182,7 @@ def _write(
     folder: Path,
     asked: dict[str, Any],
     done: Adaptation,
-    pairs: ScenePairs,
+    pairs: AdaptationPairs,
     measured: dict[str, dict[str, float]],
     missing: dict[str, str],
 ) -> None:
@@ -188,7 +190,7 @@ def _write(
     curve(steps, {"held-out pair": losses}, "denoising error", folder / "curve.png")
     summary = {
         "asked": asked,
-        "pairs": {"all": len(pairs.all), "trained": len(pairs.training)},
+        "pairs": pairs.counts(),
         "adaptation": asdict(done),
         "held_out": measured,
         "missing": missing if measured else {"held_out": "every frame of the scene is an input"},

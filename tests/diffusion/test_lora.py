@@ -13,9 +13,10 @@ from orbits import ring
 from torch import Tensor, nn
 
 from extrap_train.config import LoraConfig, ModelConfig, SamplerConfig
-from extrap_train.data.scene_pairs import ScenePairs
+from extrap_train.data.scene_pairs import adaptation_pairs
 from extrap_train.diffusion.adaptation import Adaptation, adapt
 from extrap_train.diffusion.lora import add_adapter, load_adapter, save_adapter
+from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sample_views, view_generator
 from extrap_train.errors import InputError
@@ -144,7 +145,7 @@ def _adapt(
     done = adapt(
         model,
         adapter,
-        ScenePairs(_views(3), 3),
+        adaptation_pairs(_views(3), 3, chosen.virtual_references, seed=0),
         chosen,
         SamplerConfig(),
         seconds=seconds,
@@ -152,24 +153,6 @@ def _adapt(
         fabric=Fabric(accelerator="cpu", devices=1),
     )
     return model, done
-
-
-def test_the_pairs_are_all_ordered_ones_and_the_held_out_query_is_never_a_target() -> None:
-    pairs = ScenePairs(_views(4), 3)
-    assert len(pairs.all) == 12
-    assert len(set(pairs.all)) == 12
-    query, reference = pairs.held_out
-    assert abs(query - reference) in (2, 3), "50 or 75 degrees, nearest to 60"
-    assert len(pairs.training) == 9
-    assert all(other != query for other, _ in pairs.training)
-    batch = pairs.held_out_batch(2)
-    torch.testing.assert_close(batch.image[0], _views(4)[query].image)
-    torch.testing.assert_close(batch.reference_images[0, 0], _views(4)[reference].image)
-
-
-def test_one_view_has_no_pairs() -> None:
-    with pytest.raises(InputError, match="1 input view, and pairs need at least two"):
-        ScenePairs(_views(1), 3)
 
 
 def test_adapting_learns_the_scene_repeatably_and_keeps_the_best(config: ModelConfig) -> None:
@@ -196,3 +179,42 @@ def test_it_ends_where_the_held_out_pair_gains_no_more_or_the_time_is_up(
     _, timed = _adapt(config, steps=400, seconds=0.2)
     assert timed.ended == "time"
     assert timed.steps < 400
+
+
+def test_a_long_schedule_and_many_held_out_pairs_are_measured_a_batch_at_a_time(
+    config: ModelConfig,
+) -> None:
+    """Fifty steps of a full-size model must not become fifty times the memory."""
+    model = _model(config)
+    sizes: list[int] = []
+    model.unet.register_forward_pre_hook(lambda _, arguments: sizes.append(len(arguments[0])))
+    options = replace(OPTIONS, batch_size=2, steps=1, virtual_references=5)
+    adapter = add_adapter(model, options, seed=0)
+    sampler = SamplerConfig(steps=50)
+    pairs = adaptation_pairs(_views(3), 3, options.virtual_references, seed=0)
+    fabric = Fabric(accelerator="cpu", devices=1)
+    adapt(model, adapter, pairs, options, sampler, seconds=1e-6, seed=0, fabric=fabric)
+    assert max(sizes) == 2
+    views_levels_draws = 3 * 4 * 3
+    assert sum(sizes) == 2 * views_levels_draws + 2, "measured before and after one step"
+
+
+@pytest.mark.parametrize("guidance", [1.0, 2.0])
+def test_the_null_condition_is_trained_where_sampling_asks_for_it(
+    config: ModelConfig, guidance: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[float] = []
+
+    def loss(model: ExtrapolationModel, batch: PairBatch, generator: Any, dropout: float) -> Tensor:
+        asked.append(dropout)
+        return diffusion_loss(model, batch, generator, dropout)
+
+    monkeypatch.setattr("extrap_train.diffusion.adaptation.diffusion_loss", loss)
+    model = _model(config)
+    options = replace(OPTIONS, steps=1)
+    adapter = add_adapter(model, options, seed=0)
+    pairs = adaptation_pairs(_views(2), 3, 2, seed=0)
+    fabric = Fabric(accelerator="cpu", devices=1)
+    sampler = SamplerConfig(guidance=guidance)
+    adapt(model, adapter, pairs, options, sampler, seconds=1e-6, seed=0, fabric=fabric)
+    assert [share > 0 for share in asked] == [guidance != 1]

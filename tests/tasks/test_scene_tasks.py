@@ -161,7 +161,7 @@ def test_an_adapter_is_made_used_again_and_put_upon_the_weights(
     command("task=scene", f"weights={weights}", *options)
     folder = tmp_path / "scene" / "hydrant-0000"
     summary = json.loads((folder / "summary.json").read_text())
-    assert summary["pairs"] == {"all": 12, "trained": 9}
+    assert summary["pairs"] == {"all": 32, "trained": 28}
     assert summary["adaptation"]["steps"] == 4
     assert set(summary["held_out"]) == {"model", "adapted"}
     assert math.isfinite(summary["held_out"]["adapted"]["psnr"])
@@ -220,6 +220,8 @@ def test_what_cannot_be_used_is_one_line(command, weights, tmp_path) -> None:
     assert "nor one of the package's: base, megascenes, ours-apple" in _refused(
         command, "task=scene", "weights=bse"
     )
+    lone = ["task=scene", given, "lora.virtual_references=1"]
+    assert "one of every input's is held out; give 2 or more" in _refused(command, *lone)
     view = ["task=view", given]
     assert "a pose=FRAME|FILE.json or an orbit=DEGREES" in _refused(command, *view)
     assert "neither a frame of the scene nor" in _refused(command, *view, "pose=frame99")
