@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,10 +17,13 @@ from extrap_train.config import LoraConfig, SamplerConfig
 from extrap_train.data.module import with_warp
 from extrap_train.data.scene_pairs import AdaptationPairs
 from extrap_train.diffusion.conditioning import Conditioning
-from extrap_train.diffusion.loss import diffusion_loss, prediction_errors
+from extrap_train.diffusion.loss import Anchor, diffusion_loss, prediction_errors
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.schedule import solver_of
 from extrap_train.views import PairBatch, combine
+
+Unchanged = Callable[[], AbstractContextManager[None]]
+"""In its context the adapter has no effect."""
 
 _LEVELS = 4
 """Of noise, at most, at which what is held out is measured; a long schedule is taken in strides."""
@@ -61,6 +65,10 @@ def adapt(
 ) -> Adaptation:
     """Train the adapter and leave its best weights upon the model.
 
+    With virtual references the truth is learnt where they reach, and in the holes the model is held
+    to what it painted before: few photographs say what surfaces look like here, but not what lies
+    in other directions. The inputs' own pairs are learnt whole, as in the paper.
+
     Candidates are moving averages: the base is one, and single steps away from it are noisier than
     what they learn. The best has the least error on the held-out pairs, measured with fixed noise
     at levels that the sampler steps through. `on_step` hears of every step and the share of the
@@ -71,7 +79,8 @@ def adapt(
     rate = options.learning_rate or model.config.learning_rate
     # Set up by Fabric: with fp16 its steps undo the loss's scale.
     optimizer: Any = fabric.setup_optimizers(torch.optim.AdamW(trained, lr=rate, weight_decay=0.0))
-    measure = _HeldOut(model, pairs.held_out_batch(), options.batch_size, sampler, fabric)
+    anchored = adapter.disable_adapter if options.virtual_references else None
+    measure = _HeldOut(model, pairs.held_out_batch(), options.batch_size, sampler, fabric, anchored)
     dropout = _CONDITION_DROPOUT if _is_guided(sampler) else 0.0
     losses = [(0, measure())]
     average = _weights(adapter)
@@ -81,7 +90,14 @@ def adapt(
         optimizer.param_groups[0]["lr"] = rate * min(1.0, (step + 1) / _WARMUP)
         rng = np.random.default_rng((seed, step))
         batch = pairs.training_batch(options.batch_size, rng)
-        _train_step(model, batch, optimizer, int(rng.integers(2**31)), dropout, fabric)
+        batch = with_warp(batch.to(fabric.device), model.config.image_size)
+        generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
+        with fabric.autocast():
+            anchor = _anchor(batch, anchored)
+            loss = diffusion_loss(model, batch, generator, dropout, anchor=anchor)
+        optimizer.zero_grad()
+        fabric.backward(loss)
+        optimizer.step()
         step += 1
         newest = _weights(adapter)
         for name, value in average.items():
@@ -109,21 +125,11 @@ def _is_guided(sampler: SamplerConfig) -> bool:
     return sampler.guidance != 1 or sampler.guidance_far not in (None, 1)
 
 
-def _train_step(
-    model: ExtrapolationModel,
-    batch: PairBatch,
-    optimizer: torch.optim.Optimizer,
-    noise_seed: int,
-    condition_dropout: float,
-    fabric: Fabric,
-) -> None:
-    batch = with_warp(batch.to(fabric.device), model.config.image_size)
-    generator = torch.Generator().manual_seed(noise_seed)
-    with fabric.autocast():
-        loss = diffusion_loss(model, batch, generator, condition_dropout)
-    optimizer.zero_grad()
-    fabric.backward(loss)
-    optimizer.step()
+def _anchor(batch: PairBatch, unchanged: Unchanged | None) -> Anchor | None:
+    if unchanged is None:
+        return None
+    assert batch.warp is not None
+    return Anchor(batch.warp.mask, unchanged)
 
 
 class _HeldOut:
@@ -136,8 +142,9 @@ class _HeldOut:
         most_at_once: int,
         sampler: SamplerConfig,
         fabric: Fabric,
+        unchanged: Unchanged | None,
     ) -> None:
-        self.model, self.fabric = model, fabric
+        self.model, self.fabric, self.unchanged = model, fabric, unchanged
         levels = solver_of(model.schedule, sampler).timesteps
         self.levels = levels[:: -(-len(levels) // _LEVELS)].to(fabric.device)
         self.draws = -(-_DRAWS // len(batch.image))
@@ -145,18 +152,19 @@ class _HeldOut:
         self.parts = [self._part(_chosen(batch, part)) for part in places]
 
     @torch.no_grad()
-    def _part(self, batch: PairBatch) -> tuple[Tensor, Conditioning]:
+    def _part(self, batch: PairBatch) -> tuple[Tensor, Conditioning, Anchor | None]:
         batch = with_warp(batch.to(self.fabric.device), self.model.config.image_size)
         with self.fabric.autocast():
             conditioning = self.model.condition(batch)
-            return self.model.encode_target(batch.image, conditioning), conditioning
+            target = self.model.encode_target(batch.image, conditioning)
+        return target, conditioning, _anchor(batch, self.unchanged)
 
     @torch.no_grad()
     def __call__(self) -> float:
         generator = torch.Generator().manual_seed(0)
         errors = [
-            self._errors(target, conditioning, level, generator)
-            for target, conditioning in self.parts
+            self._errors(target, conditioning, anchor, level, generator)
+            for target, conditioning, anchor in self.parts
             for level in self.levels
             for _ in range(self.draws)
         ]
@@ -166,14 +174,14 @@ class _HeldOut:
         self,
         target: Float[Tensor, "b z h w"],
         conditioning: Conditioning,
+        anchor: Anchor | None,
         level: Int[Tensor, ""],
         generator: torch.Generator,
     ) -> Float[Tensor, " b"]:
         noise = torch.randn(target.shape, generator=generator).to(target)
         with self.fabric.autocast():
-            return prediction_errors(
-                self.model, target, noise, level.expand(len(target)), conditioning
-            )
+            levels = level.expand(len(target))
+            return prediction_errors(self.model, target, noise, levels, conditioning, anchor)
 
 
 def _chosen(batch: PairBatch, places: Int[Tensor, " n"]) -> PairBatch:

@@ -1,5 +1,9 @@
 """The denoising loss: how far a prediction is from what the schedule asks for."""
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+
 import torch
 from diffusers import DDIMScheduler
 from jaxtyping import Float, Int
@@ -11,12 +15,23 @@ from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.views import PairBatch
 
 
+@dataclass(frozen=True)
+class Anchor:
+    """Where a model that is adapted is to predict what it predicted before."""
+
+    known: Float[Tensor, "b h w"]
+    """1 where the truth is learnt, 0 where the model is to stay as it was."""
+    unchanged: Callable[[], AbstractContextManager[None]]
+    """In its context the model is as it was."""
+
+
 def diffusion_loss(
     model: ExtrapolationModel,
     batch: PairBatch,
     generator: torch.Generator,
     condition_dropout: float,
     min_snr: float | None = None,
+    anchor: Anchor | None = None,
 ) -> Float[Tensor, ""]:
     """Mean squared error of the prediction at one random noise level per example, or per group of
     views that are denoised together.
@@ -33,7 +48,7 @@ def diffusion_loss(
     dropped, timestep = (x.repeat_interleave(batch.joint_views) for x in (dropped, timestep))
     noise = torch.randn(target.shape, generator=generator).to(target)
     conditioning = conditioning.zeroed(dropped.to(target.device))
-    errors = prediction_errors(model, target, noise, timestep, conditioning)
+    errors = prediction_errors(model, target, noise, timestep, conditioning, anchor)
     if min_snr is not None:
         errors = errors * snr_weights(model.schedule, timestep, min_snr)
     return errors.mean()
@@ -45,8 +60,13 @@ def prediction_errors(
     noise: Float[Tensor, "b z h w"],
     timestep: Int[Tensor, " b"],
     conditioning: Conditioning,
+    anchor: Anchor | None = None,
 ) -> Float[Tensor, " b"]:
-    """Each example's mean squared error at a noise level of one's choice."""
+    """Each example's mean squared error at a noise level of one's choice.
+
+    With an anchor, against the truth where it is known and the unchanged model's prediction
+    elsewhere, mixed by area where a latent is both.
+    """
     noisy = model.schedule.add_noise(target, noise, timestep)
     prediction = model(noisy, timestep, conditioning)
     wanted = {
@@ -54,6 +74,11 @@ def prediction_errors(
         "sample": lambda: target,
         "v_prediction": lambda: model.schedule.get_velocity(target, noise, timestep),
     }[model.config.prediction]()
+    if anchor is not None:
+        with torch.no_grad(), anchor.unchanged():
+            before = model(noisy, timestep, conditioning).to(wanted)
+        known = functional.interpolate(anchor.known[:, None], wanted.shape[-2:], mode="area")
+        wanted = torch.lerp(before, wanted, known.to(wanted).expand_as(wanted))
     return functional.mse_loss(prediction, wanted, reduction="none").mean((1, 2, 3))
 
 

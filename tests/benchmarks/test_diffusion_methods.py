@@ -30,7 +30,7 @@ from extrap_train.jobs.local import LocalLauncher
 from extrap_train.views import View
 from tests.benchmarks.analytic import scene_inputs
 
-STEPS = 20
+STEPS = 50
 VARIANTS: dict[str, Diffusion] = {
     "ours": Diffusion(),
     "one reference": Diffusion(references=1),
