@@ -1,12 +1,14 @@
-"""Weights of noise levels, by hand."""
+"""Weights of noise levels and of what is known, by hand."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import pytest
 import torch
 
 from extrap_train.config import ModelConfig
-from extrap_train.diffusion.loss import diffusion_loss, prediction_errors, snr_weights
+from extrap_train.diffusion.loss import Anchor, diffusion_loss, prediction_errors, snr_weights
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.schedule import noise_schedule
 from extrap_train.views import PairBatch
@@ -59,3 +61,50 @@ def test_weights_change_the_loss_and_not_the_noise(config: ModelConfig, batch: P
     plain = diffusion_loss(model, batch, torch.Generator().manual_seed(3), 0.0)
     weighted = diffusion_loss(model, batch, torch.Generator().manual_seed(3), 0.0, 1e-9)
     assert float(weighted) == pytest.approx(1e-9 * float(plain), rel=1e-4)
+
+
+@pytest.mark.parametrize("prediction", ["epsilon", "v_prediction", "sample"])
+def test_an_anchored_model_learns_the_truth_where_it_is_known_and_itself_elsewhere(
+    config: ModelConfig, batch: PairBatch, prediction: str
+) -> None:
+    """The left half is known: the errors there are against the truth, on the right against what
+    the model said before its last layer was changed.
+    """
+    model = ExtrapolationModel(replace(config, prediction=prediction, zero_terminal_snr=False))
+    torch.nn.init.normal_(model.unet.conv_out.weight, std=0.1)
+    bias = model.unet.conv_out.bias
+    assert bias is not None
+
+    @contextmanager
+    def unchanged() -> Iterator[None]:
+        bias.data -= 0.5
+        yield
+        bias.data += 0.5
+
+    bias.data += 0.5
+    known = torch.zeros(3, config.image_size, config.image_size)
+    known[..., : config.image_size // 2] = 1
+    conditioning = model.condition(batch)
+    target = model.encode_target(batch.image, conditioning)
+    noise, level = torch.ones_like(target), torch.tensor([100, 500, 900])
+    told = (model, target, noise, level, conditioning)
+    everywhere = Anchor(torch.ones_like(known), unchanged)
+    nowhere = Anchor(torch.zeros_like(known), unchanged)
+    with torch.no_grad():
+        plain, half = prediction_errors(*told), prediction_errors(*told, Anchor(known, unchanged))
+        torch.testing.assert_close(prediction_errors(*told, everywhere), plain)
+        moved = torch.full((3,), 0.25)  # of every channel by a half, squared
+        torch.testing.assert_close(prediction_errors(*told, nowhere), moved, atol=1e-4, rtol=0)
+        left = _left_half_error(*told)
+        torch.testing.assert_close(half, left / 2 + moved / 2, atol=1e-4, rtol=1e-4)
+
+
+def _left_half_error(model, target, noise, level, conditioning) -> torch.Tensor:
+    noisy = model.schedule.add_noise(target, noise, level)
+    wanted = {
+        "epsilon": noise,
+        "sample": target,
+        "v_prediction": model.schedule.get_velocity(target, noise, level),
+    }[model.config.prediction]
+    error = (model(noisy, level, conditioning) - wanted).square()
+    return error[..., : error.shape[-1] // 2].mean((1, 2, 3))
