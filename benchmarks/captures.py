@@ -87,8 +87,8 @@ def _synthetic(config: CapturesConfig, category: str, index: int) -> Capture:
 
 
 def _with_cloud(sequence: Sequence) -> Capture:
-    cloud = sequence.point_cloud
-    if cloud is None or not cloud.is_file():
+    cloud = sequence.point_cloud.find() if sequence.point_cloud else None
+    if cloud is None:
         return Capture(sequence)
     return Capture(sequence, lambda: TrueSurface(read_points(cloud), torch.zeros(0, 3)))
 

@@ -19,7 +19,7 @@ from extrap_train.data.annotations import (
     read_sequence_annotations,
 )
 from extrap_train.data.co3d_frames import Co3dFrames
-from extrap_train.data.sequences import Sequence
+from extrap_train.data.sequences import PointCloud, Sequence
 from extrap_train.errors import InputError, did_you_mean
 
 FRAME_ANNOTATIONS = "frame_annotations.jgz"
@@ -124,5 +124,5 @@ def _sequence(
         frames=frames,
         viewpoint_quality=details.viewpoint_quality if details else None,
         point_cloud_quality=details.point_cloud_quality if details else None,
-        point_cloud=root / cloud if cloud else None,
+        point_cloud=PointCloud(root, cloud) if cloud else None,
     )

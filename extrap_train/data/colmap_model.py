@@ -9,7 +9,7 @@ from extrap_train.data.colmap_records import ModelCamera, ModelImage
 from extrap_train.data.colmap_text import read_text_cameras, read_text_images
 from extrap_train.data.files import check_relative
 from extrap_train.data.photographs import Photograph, present_pictures, sequence_of_photographs
-from extrap_train.data.sequences import Sequence
+from extrap_train.data.sequences import PointCloud, Sequence
 from extrap_train.errors import InputError
 from extrap_train.geometry.colmap import world_to_cam_from_colmap
 
@@ -45,13 +45,12 @@ def read_model(model: Path, images: Path, name: str) -> Sequence:
     paths = [check_relative(entry.name, images_file) for entry in entries]
     present = present_pictures(images, paths, images_file)
     by_number = {camera.number: camera for camera in cameras}
-    cloud = model / POINT_CLOUD
     return sequence_of_photographs(
         images,
         name,
         [_photograph(entry, by_number, images_file) for entry in entries if entry.name in present],
         images_file,
-        point_cloud=cloud if cloud.is_file() else None,
+        point_cloud=PointCloud(model, POINT_CLOUD),
     )
 
 

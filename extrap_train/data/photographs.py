@@ -12,7 +12,7 @@ from torch import Tensor
 
 from extrap_train.data.files import resolve_inside
 from extrap_train.data.images import known_depth, read_image, read_mask, read_sixteen_bit
-from extrap_train.data.sequences import Frame, Sequence
+from extrap_train.data.sequences import Frame, PointCloud, Sequence
 from extrap_train.data.validation import require_sound
 from extrap_train.errors import InputError
 from extrap_train.geometry.lens import Lens, undistort
@@ -98,7 +98,7 @@ def sequence_of_photographs(
     name: str,
     photographs: List[Photograph],
     description: Path,
-    point_cloud: Path | None = None,
+    point_cloud: PointCloud | None = None,
 ) -> Sequence:
     """A sequence of photographs in the order of their paths.
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrap_train.data.files import check_relative
+from extrap_train.data.files import check_relative, resolve_inside
 from extrap_train.data.images import image_size
 from extrap_train.data.json_files import read_json
 from extrap_train.data.photographs import (
@@ -18,7 +18,7 @@ from extrap_train.data.photographs import (
     present_pictures,
     sequence_of_photographs,
 )
-from extrap_train.data.sequences import Sequence
+from extrap_train.data.sequences import PointCloud, Sequence
 from extrap_train.data.validation import require_dict, require_list
 from extrap_train.errors import InputError
 from extrap_train.geometry.colmap import CAMERA_MODELS, lens_from_parameters
@@ -56,7 +56,7 @@ def read_transforms(folder: Path) -> Sequence:
             if path in present
         ],
         file,
-        point_cloud=folder / check_relative(str(cloud), file) if cloud else None,
+        point_cloud=PointCloud(folder, check_relative(str(cloud), file)) if cloud else None,
     )
 
 
@@ -95,7 +95,7 @@ def _picture_path(folder: Path, entry: Any, index: int, file: Path) -> str:
 
 def _photograph(folder: Path, path: str, entry: dict[str, Any], file: Path) -> Photograph:
     try:
-        height, width = _size(folder / path, entry)
+        height, width = _size(folder, path, entry)
         return Photograph(
             image_path=path,
             height=height,
@@ -117,9 +117,9 @@ def _photograph(folder: Path, path: str, entry: dict[str, Any], file: Path) -> P
         raise InputError(f"{file}: entry {path} is malformed ({error}); correct it") from None
 
 
-def _size(picture: Path, entry: dict[str, Any]) -> tuple[int, int]:
+def _size(folder: Path, picture: str, entry: dict[str, Any]) -> tuple[int, int]:
     if "h" not in entry and "w" not in entry:
-        return image_size(picture)
+        return image_size(resolve_inside(folder, picture))
     height, width = int(entry["h"]), int(entry["w"])
     if height <= 0 or width <= 0:
         raise ValueError(f"image size {height} x {width}")

@@ -5,6 +5,7 @@ from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
 from pathlib import Path
 
+from extrap_train.data.files import resolve_inside
 from extrap_train.views import Camera, View
 
 
@@ -25,6 +26,21 @@ class Frame:
 
 
 @dataclass(frozen=True)
+class PointCloud:
+    """A file of points as a description lists it, which need not be there."""
+
+    root: Path
+    """Of the data set: no link may lead out of it."""
+    path: str
+
+    def find(self) -> Path | None:
+        """The real file, None where there is none; InputError where a link leads out of `root`."""
+        if not (self.root / self.path).is_file():
+            return None
+        return resolve_inside(self.root, self.path)
+
+
+@dataclass(frozen=True)
 class Sequence:
     """A capture of one scene."""
 
@@ -35,4 +51,4 @@ class Sequence:
     viewpoint_quality: float | None = None
     """CO3D's score of its camera poses; None where the capture has none."""
     point_cloud_quality: float | None = None
-    point_cloud: Path | None = None
+    point_cloud: PointCloud | None = None

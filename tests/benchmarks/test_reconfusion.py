@@ -52,6 +52,22 @@ def _captures(root: Path) -> CapturesConfig:
     return CapturesConfig(source="reconfusion", root=str(root))
 
 
+@pytest.mark.parametrize("leads", ["out", "nowhere"])
+def test_a_cloud_is_not_read_through_a_link_that_leads_out(root: Path, leads: str) -> None:
+    file = root / "34_1479_4753" / "transforms.json"
+    content = json.loads(file.read_text())
+    file.write_text(json.dumps({**content, "ply_file_path": "cloud.ply"}))
+    outside = root.parent / "outside.ply"
+    file.with_name("cloud.ply").symlink_to(outside)
+    if leads == "nowhere":
+        (capture,) = open_captures(_captures(root), [])
+        assert capture.surface is None
+        return
+    outside.write_text("ply")
+    with pytest.raises(InputError, match=r"cloud\.ply: leads out of"):
+        open_captures(_captures(root), [])
+
+
 def test_ids_count_the_frames_in_name_order(root: Path) -> None:
     config = _captures(root)
     (draw,) = freeze(config, _RULES, open_captures(config, [])).draws

@@ -9,6 +9,7 @@ from plyfile import PlyData
 
 from extrap_train.data import co3d
 from extrap_train.data.co3d import list_categories, read_category, read_sequence
+from extrap_train.errors import InputError
 from extrap_train.geometry.cameras import project
 
 
@@ -43,9 +44,18 @@ def test_the_point_cloud_and_the_quality_are_found(root):
     sequence = read_sequence(root, "cup", "two")
     assert sequence.viewpoint_quality == 1
     assert sequence.point_cloud_quality == 1
-    vertices = PlyData.read(sequence.point_cloud)["vertex"]
+    vertices = PlyData.read(sequence.point_cloud.find())["vertex"]
     assert vertices.count == 20
     assert {"x", "y", "z", "red", "green", "blue"} <= set(vertices.data.dtype.names)
+
+
+def test_a_point_cloud_that_a_link_leads_to_from_outside_is_refused(root, tmp_path_factory):
+    cloud = root / "cup" / "two" / "pointcloud.ply"
+    outside = cloud.rename(tmp_path_factory.mktemp("outside") / "cloud.ply")
+    assert read_sequence(root, "cup", "two").point_cloud.find() is None
+    cloud.symlink_to(outside)
+    with pytest.raises(InputError, match="leads out of"):
+        read_sequence(root, "cup", "two").point_cloud.find()
 
 
 def test_the_same_views_give_the_same_bytes(tmp_path):

@@ -108,6 +108,16 @@ def test_no_picture_at_all(folder):
     assert "none of the 3 pictures" in complaint(folder)
 
 
+def test_a_picture_outside_is_not_even_measured(folder):
+    picture = folder / "images" / "001.png"
+    picture.symlink_to(picture.rename(folder.parent / "outside.png"))
+    content = read_json(folder)
+    del content["h"], content["w"]
+    write_json(folder, content)
+    with pytest.raises(InputError, match=r"001\.png: leads out of"):
+        read_transforms(folder)
+
+
 def test_lens_distortion_is_undone(folder):
     content = read_json(folder) | {"k1": 0.3, "k2": -0.05, "p1": 0.002, "p2": 0.001}
     write_json(folder, content)

@@ -52,7 +52,7 @@ def test_the_reader_finds_what_was_rendered(made):
     torch.testing.assert_close(view.depth, expected.depth, rtol=1e-3, atol=0)
     assert torch.equal(view.mask, expected.mask)
     assert (view.image - expected.image).abs().mean() < 0.03  # a JPEG
-    assert sequences[1].point_cloud is not None
+    assert sequences[1].point_cloud.find() is not None
 
 
 def test_the_same_files_for_any_number_of_workers(made, tmp_path):
