@@ -24,8 +24,10 @@ from extrap_train import config as schema
 from extrap_train.errors import InputError
 from extrap_train.tasks import TASKS
 
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS)
-"""What a full or closed disk says, wherever it is written to."""
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
+"""What a full disk says, wherever it is written to."""
+_CLOSED = (errno.EACCES, errno.EROFS)
+"""What is said of a place that may not be read or written."""
 _NO_FOLDER = (errno.ENOTDIR, errno.ENOENT, errno.EEXIST)
 """What is said below an output that can be no folder."""
 
@@ -71,8 +73,10 @@ def command(name: str, run: Callable[[Any], Path | None]) -> None:
 
     @hydra.main(version_base="1.3", config_path="pkg://conf", config_name=name)
     def composed(config: DictConfig) -> Path | None:
+        output = "."
         try:
             typed = typed_config(config)
+            output = typed.output
             _check_processes(typed)
             _use_threads(getattr(typed, "threads", None))
             return run(typed)
@@ -81,14 +85,13 @@ def command(name: str, run: Callable[[Any], Path | None]) -> None:
                 raise  # the other jobs of a sweep still run
             sys.exit(f"error: {error}")  # before Hydra adds a line of its own
         except OSError as error:
-            output = getattr(typed, "output", ".")
-            if not _is_of_output(error, output) or HydraConfig.get().mode == RunMode.MULTIRUN:
+            said = _remedy(error, output)
+            if said is None or HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise
-            where = error.filename or output
-            sys.exit(f"error: {where}: {error.strerror}; free space or choose another output=")
+            sys.exit(f"error: {error.filename or output}: {error.strerror}; {said}")
 
     try:
-        _check(name, sys.argv[1:])
+        _complete_help(sys.argv)
         os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # what is left to go wrong is a bug
         composed()
     except InputError as error:
@@ -99,13 +102,23 @@ def command(name: str, run: Callable[[Any], Path | None]) -> None:
         sys.exit("interrupted: run the same command again to resume")
 
 
-def _is_of_output(error: OSError, output: str) -> bool:
-    """Whether it says that nothing can be written where it should be."""
-    if error.errno in _NO_ROOM:
-        return True
-    place = Path(str(error.filename)).absolute()
-    is_below = place.is_relative_to(Path(output).absolute())
-    return error.errno in _NO_FOLDER and is_below and not Path(output).is_dir()
+def _remedy(error: OSError, output: str) -> str | None:
+    """What a user can do about it; None where it says nothing of a disk or folder of theirs."""
+    place = Path(str(error.filename or output))
+    is_of_output = _is_of_output(place.absolute(), Path(output).absolute())
+    if error.errno in _NO_ROOM or (is_of_output and error.errno in _CLOSED):
+        return "free space or choose another output="
+    if is_of_output and error.errno in _NO_FOLDER and not Path(output).is_dir():
+        return "choose another output="
+    if error.errno in _CLOSED:
+        return "change its rights, or name another place"
+    return None
+
+
+def _is_of_output(place: Path, output: Path) -> bool:
+    """Whether it lies below the output, or is a folder above that could not be made."""
+    is_missing_parent = output.is_relative_to(place) and not os.access(place, os.F_OK)
+    return place.is_relative_to(output) or is_missing_parent
 
 
 def typed_config(config: DictConfig) -> Any:
@@ -128,30 +141,20 @@ def _check_processes(config: Any) -> None:
         )
 
 
-def _check(name: str, arguments: list[str]) -> None:
-    """Compose once before Hydra does, so that its errors fit one line with a suggestion."""
-    overrides = _overrides(arguments)
-    if {"--help", "-h"} & set(arguments):
-        if not any(o.startswith(("category=", "experiment=")) for o in overrides):
-            sys.argv.append("category=hydrant")  # help shows a whole tree
+def _complete_help(words: list[str]) -> None:
+    """Help shows a whole tree, for which something must be chosen; `words` are the command's."""
+    overrides = _overrides(words[1:])
+    if not {"--help", "-h"} & set(words) or any(
+        override.startswith(("category=", "experiment=")) for override in overrides
+    ):
         return
-    if {"-m", "--multirun", "--hydra-help", "--version", "--info", "-i"} & set(arguments):
-        return
-    try:
-        with hydra.initialize_config_module("conf", version_base="1.3"):
-            typed_config(hydra.compose(name, overrides))
-    except (HydraException, OmegaConfBaseException) as error:
-        raise InputError(_one_line(error, overrides)) from None
+    place = words.index(overrides[0]) if overrides else len(words)  # they must stand together
+    words.insert(place, "category=hydrant")
 
 
 def _overrides(arguments: list[str]) -> list[str]:
-    """What is left without flags and the value that some of Hydra's take."""
-    valued = {"--cfg", "-c", "--package", "-p", "--config-name", "-cn", "--config-dir", "-cd"}
-    return [
-        argument
-        for before, argument in zip(["", *arguments], arguments, strict=False)
-        if not argument.startswith("-") and before not in valued
-    ]
+    """What is no flag of Hydra's, nor looks like the value of one."""
+    return [w for w in arguments if not w.startswith("-") and ("=" in w or w.startswith("~"))]
 
 
 def _one_line(error: Exception, overrides: list[str]) -> str:

@@ -98,6 +98,107 @@ def test_a_full_disk_anywhere_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_p
     assert "out: No space left on device" in _error(["category=hydrant"], monkeypatch, tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("place", "remedy"),
+    [
+        ("out", "choose another output="),
+        ("out/a/b", "choose"),
+        ("data/cup", "change its rights"),
+    ],
+)
+def test_a_closed_place_is_called_what_it_is(
+    place: str, remedy: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def closed(_: object) -> None:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(tmp_path / place))
+
+    monkeypatch.setattr("extrap_train.__main__.task", lambda name: closed)
+    message = _error(["category=hydrant"], monkeypatch, tmp_path)
+    assert f"{place}: Permission denied; " in message
+    assert remedy in message
+
+
+def test_a_folder_above_the_output_that_cannot_be_made_is_of_the_output(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def closed(_: object) -> None:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(tmp_path / "out"))
+
+    monkeypatch.setattr("extrap_train.__main__.task", lambda name: closed)
+    options = ["extrap_train", "category=hydrant", f"output={tmp_path / 'out' / 'deep' / 'down'}"]
+    monkeypatch.setattr(sys, "argv", options)
+    with pytest.raises(SystemExit, match=r"out: Permission denied; .* choose another output="):
+        main()
+
+
+def test_a_root_that_may_not_be_looked_at_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Even where that is found while the options are still checked."""
+
+    def closed(*_: object) -> None:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), "/closed/co3d")
+
+    monkeypatch.setattr("extrap_train.config.validate", closed)
+    options = ["category=hydrant", "data=co3d", "data.root=/closed/co3d"]
+    message = _error(options, monkeypatch, tmp_path)
+    assert (
+        message
+        == "error: /closed/co3d: Permission denied; change its rights, or name another place"
+    )
+
+
+@pytest.fixture
+def own_choices(tmp_path: Path) -> Path:
+    """A folder with a category of one's own."""
+    (tmp_path / "cfg" / "category").mkdir(parents=True)
+    content = "defaults: [category_schema, _self_]\nname: mine\nmembers: [mine]\n"
+    (tmp_path / "cfg" / "category" / "mine.yaml").write_text(content)
+    return tmp_path / "cfg"
+
+
+@pytest.mark.parametrize("form", ["--config-dir {}", "--config-dir={}", "-cd {}"])
+def test_a_category_is_added_with_one_file_in_a_folder_of_ones_own(
+    form: str, own_choices: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    members: list[str] = []
+    task = members.extend
+    monkeypatch.setattr("extrap_train.__main__.task", lambda _: lambda c: task(c.category.members))
+    flags = form.format(own_choices).split()
+    monkeypatch.setattr(sys, "argv", ["extrap_train", *flags, "category=mine", "depth=stereo"])
+    main()
+    assert members == ["mine"]
+
+
+def test_a_choice_that_is_in_no_folder_lists_those_of_ones_own(
+    own_choices: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    message = _error([f"--config-dir={own_choices}", "category=mien"], monkeypatch, tmp_path)
+    assert "did you mean mine?; known: all, apple, book, chair, cup, hydrant, mine" in message
+    message = _error(["--config-dir", "/nowhere", "category=mine"], monkeypatch, tmp_path)
+    assert "'/nowhere' not found" in message
+
+
+def test_the_shell_completes_choices(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COMP_LINE", "extrap_train category=hy")
+    monkeypatch.setenv("COMP_POINT", "24")
+    monkeypatch.setattr(sys, "argv", ["extrap_train", "-sc", "query=bash"])
+    main()
+    assert capsys.readouterr().out.split() == ["category=hydrant"]
+
+
+def test_help_takes_options_before_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["extrap_train", "trainer.steps=77", "--help"])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert not stopped.value.code
+    assert "steps: 77" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("place", ["file", "/proc/nowhere"])
 def test_an_output_that_can_be_no_folder_is_one_line(
     place: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
