@@ -154,17 +154,22 @@ def remove_partial(folder: Path) -> None:
         if _is_being_written(path):
             continue
         if path.is_dir():
-            shutil.rmtree(path)
+            shutil.rmtree(path, ignore_errors=True)  # another process may be removing it too
         else:
-            path.unlink()
+            path.unlink(missing_ok=True)
 
 
 def _is_being_written(path: Path) -> bool:
+    """Whether its writer may be alive; what vanishes meanwhile is one's who is."""
     writer = _WRITER.search(path.name)
     if writer is None or writer["pid"] == str(os.getpid()):
         return False
     if writer["host"] != _host():
-        return time.time() - max(p.stat().st_mtime for p in (path, *path.rglob("*"))) < _ABANDONED_S
+        try:
+            newest = max(p.stat().st_mtime for p in (path, *path.rglob("*")))
+        except FileNotFoundError:
+            return True
+        return time.time() - newest < _ABANDONED_S
     try:
         os.kill(int(writer["pid"]), 0)
     except ProcessLookupError:

@@ -1,6 +1,7 @@
 import errno
 import multiprocessing
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -152,6 +153,32 @@ def test_only_what_nobody_writes_any_more_is_removed(tmp_path):
     living.communicate()
     remove_partial(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {elsewhere}
+
+
+@pytest.mark.parametrize(
+    ("owner", "step", "is_folder"),
+    [(Path, "rglob", True), (shutil, "rmtree", True), (Path, "unlink", False)],
+)
+def test_what_vanishes_while_it_is_cleared_away_is_no_error(
+    tmp_path, monkeypatch, owner, step, is_folder
+):
+    """Its writer on another machine may be finishing, or another process be clearing up too."""
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    other = folder / ".one.other_host-7.abc.tmp"
+    other.mkdir() if is_folder else other.touch()
+    os.utime(other, (0, 0))
+    really = getattr(owner, step)
+
+    def too_late(path, *arguments, **options):
+        if path == other and other.exists():
+            other.rename(tmp_path / "gone")
+        return really(path, *arguments, **options)
+
+    monkeypatch.setattr(owner, step, too_late)
+    remove_partial(folder)
+    assert {path.name for path in tmp_path.iterdir()} == {"folder", "gone"}
+    assert list(folder.iterdir()) == []
 
 
 @pytest.mark.parametrize("shape", [(0, 2, 3), (5,), (3, 700, 4)])
