@@ -70,7 +70,7 @@ def capture(
         return View(grey, camera[index], flat, mask(index), f"frame{index}")
 
     frames = tuple(
-        Frame(f"frame{i}", camera[i], True, mask(i) is not None, lambda i=i: load(i))
+        Frame(f"frame{i}", camera[i], True, mask(i) is not None, lambda i=i: load(i), ())
         for i in range(count)
     )
     return Sequence("cup", name, frames, **quality)
@@ -113,6 +113,7 @@ def textured_capture(
             True,
             False,
             _Textured(camera, f"frame{i}", depth_factor, i in broken).load,
+            (),
         )
         for i, camera in enumerate(cameras)
     )

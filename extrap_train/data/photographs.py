@@ -49,6 +49,12 @@ class _Loader:
     camera: Camera
     name: str
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        photo = self.photograph
+        paths = (photo.image_path, photo.mask_path, photo.depth_path)
+        return tuple(self.root / path for path in paths if path)
+
     def load(self) -> View:
         photo, size = self.photograph, (self.camera.height, self.camera.width)
         image = read_image(resolve_inside(self.root, photo.image_path), size)
@@ -112,13 +118,15 @@ def sequence_of_photographs(
     frames = []
     for photo, frame_name in zip(ordered, _frame_names(paths), strict=True):
         pinhole, camera = pinhole_camera(photo, description)
+        loader = _Loader(root, photo, pinhole, camera, frame_name)
         frames.append(
             Frame(
                 name=frame_name,
                 camera=camera,
                 has_depth=photo.depth_path is not None,
                 has_mask=photo.mask_path is not None,
-                load=_Loader(root, photo, pinhole, camera, frame_name).load,
+                load=loader.load,
+                files=loader.files,
             )
         )
     return Sequence(CATEGORY, name, tuple(frames), point_cloud=point_cloud)

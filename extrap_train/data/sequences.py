@@ -21,8 +21,8 @@ class Frame:
     has_mask: bool
     load: Callable[[], View]
     """Reads image, depth and mask at full resolution; raises InputError that names the file."""
-    files: tuple[Path, ...] = ()
-    """What `load` reads."""
+    files: tuple[Path, ...]
+    """What `load` reads; none where it renders."""
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ def analytic_capture(count: int = 12, size: int = 32, name: str = "one") -> Sequ
     frames = []
     for index in range(count):
         view = replace(view_at(360 * index / count, size), name=f"{index:03d}.png")
-        frames.append(Frame(view.name, view.camera, True, False, _Photograph(view)))
+        frames.append(Frame(view.name, view.camera, True, False, _Photograph(view), ()))
     return Sequence("apple", name, tuple(frames))
 
 

@@ -96,6 +96,7 @@ def test_what_was_photographed_is_read(model):
         torch.testing.assert_close(view.image, truth.image, rtol=0, atol=0.5 / 255 + 1e-6)
         assert view.depth is None
         assert view.mask is None
+        assert frame.files == (model / "images" / frame.name,)
 
 
 def test_entries_without_a_picture_are_reported(model, caplog):

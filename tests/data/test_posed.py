@@ -7,6 +7,7 @@ import torch
 from captures import SCENE, view_at
 from PIL import Image
 
+from data_prep.frames import CaptureKeys
 from extrap_train.data.posed import read_transforms
 from extrap_train.errors import InputError
 from extrap_train.geometry.opengl import opengl_from_world_to_cam
@@ -79,6 +80,22 @@ def test_what_was_photographed_is_read(folder):
         torch.testing.assert_close(read.image, truth.image, rtol=0, atol=0.5 / 255 + 1e-6)
         torch.testing.assert_close(read.depth, truth.depth, rtol=0, atol=6e-4)
         torch.testing.assert_close(read.mask, truth.mask)
+
+
+def test_a_frame_says_what_it_reads(folder):
+    names = ("images/001.png", "mask_001.png", "depth_001.png")
+    assert read_transforms(folder).frames[1].files == tuple(folder / name for name in names)
+
+
+@pytest.mark.parametrize("name", ["images/001.png", "mask_001.png", "depth_001.png"])
+def test_a_replaced_file_is_another_capture(folder, name):
+    before = CaptureKeys.of(read_transforms(folder))
+    with (folder / name).open("ab") as file:
+        file.write(b"more")
+    after = CaptureKeys.of(read_transforms(folder))
+    assert before.content == after.content
+    assert before.files != after.files
+    assert before.sizes != after.sizes
 
 
 def test_intrinsics_may_be_common_to_all_or_an_angle(folder):

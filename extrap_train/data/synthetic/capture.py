@@ -33,5 +33,5 @@ def synthetic_sequence(category: str, index: int, options: SyntheticConfig) -> S
     frames = []
     for number in range(options.frames):
         name, camera = f"frame{number:06d}", cameras[number]
-        frames.append(Frame(name, camera, True, True, _Renderer(scene, camera, name).load))
+        frames.append(Frame(name, camera, True, True, _Renderer(scene, camera, name).load, ()))
     return Sequence(category, sequence_name(index), tuple(frames))
