@@ -1,6 +1,7 @@
 """The test captures of a table, whatever they come from."""
 
 from collections.abc import Callable
+from collections.abc import Sequence as List
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import torch
 from benchmarks.files import read_points
 from benchmarks.protocol import Draw, Protocol, draw_sequence
 from benchmarks.scenes import TrueSurface
+from benchmarks.training import TrainedModel, held_out_by_all
 from data_prep.filter import judge_all
 from data_prep.split import split_sequences
 from extrap_train.config import CapturesConfig, PrepConfig, RulesConfig, SyntheticConfig
@@ -37,8 +39,23 @@ class Capture:
     surface: Callable[[], TrueSurface] | None = None
 
 
-def open_captures(config: CapturesConfig, categories: list[str]) -> list[Capture]:
-    """The test captures of some categories; nothing is rendered or decoded yet."""
+def open_captures(
+    config: CapturesConfig, categories: list[str], models: List[TrainedModel] = ()
+) -> list[Capture]:
+    """The test captures of some categories; nothing is rendered or decoded yet.
+
+    Raises InputError for a capture that one of the `models` was trained on.
+    """
+    captures = _open(config, categories, models)
+    if config.source != "synthetic":
+        for model in models:
+            model.require_unseen(capture.sequence for capture in captures)
+    return captures
+
+
+def _open(
+    config: CapturesConfig, categories: list[str], models: List[TrainedModel]
+) -> list[Capture]:
     match config.source:
         case "synthetic":
             return [
@@ -47,7 +64,9 @@ def open_captures(config: CapturesConfig, categories: list[str]) -> list[Capture
                 for index in range(config.sequences)
             ]
         case "co3d":
-            return [_with_cloud(s) for category in categories for s in _co3d(config, category)]
+            return [
+                _with_cloud(s) for category in categories for s in _co3d(config, category, models)
+            ]
         case "reconfusion":
             return [_with_cloud(s) for s in _reconfusion(config)]
         case _:
@@ -93,11 +112,17 @@ def _with_cloud(sequence: Sequence) -> Capture:
     return Capture(sequence, lambda: TrueSurface(read_points(cloud), torch.zeros(0, 3)))
 
 
-def _co3d(config: CapturesConfig, category: str) -> list[Sequence]:
-    """The captures that training on the same download holds out."""
+def _co3d(config: CapturesConfig, category: str, models: List[TrainedModel]) -> list[Sequence]:
+    """The captures that the models' runs have held out; where no run says so, those that training
+    on the same download with its usual options does.
+    """
     if config.root is None:
         raise InputError("captures.source=co3d needs the download: give captures.root=FOLDER")
     sequences = {f"{s.category}/{s.name}": s for s in read_category(Path(config.root), category)}
+    present = [sequence.name for sequence in sequences.values()]
+    named = held_out_by_all(models, category, present, config.sequences)
+    if named is not None:
+        return [sequences[f"{category}/{name}"] for name in named]
     verdicts = judge_all(list(sequences.values()), PrepConfig())
     kept = [name for name, verdict in zip(sequences, verdicts, strict=True) if verdict.kept]
     if not kept:

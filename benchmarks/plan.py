@@ -17,6 +17,7 @@ from benchmarks.methods.build import build_method
 from benchmarks.protocol import Draw, Protocol, digest
 from benchmarks.scene_writing import prepare_scene
 from benchmarks.scenes import Scene
+from benchmarks.training import trained_models
 from extrap_train.config import MethodConfig, TableConfig
 from extrap_train.data.frame_files import sequence_folder
 from extrap_train.errors import InputError
@@ -98,13 +99,16 @@ def selected_draws(table: TableConfig, protocol: Protocol, quick: bool) -> list[
     return draws
 
 
-def open_protocol(table: TableConfig, folder: TableFolder) -> tuple[Protocol, list[Capture]]:
+def open_protocol(
+    table: TableConfig, folder: TableFolder, methods: Iterable[MethodConfig] = ()
+) -> tuple[Protocol, list[Capture]]:
     """The table's frozen protocol, made now if there is none yet, and its captures.
 
     One without any result is made anew. Raises InputError where the folder holds results of another
-    protocol, and for two captures of one name.
+    protocol, for two captures of one name, and for one that a method's model was trained on.
     """
-    captures = open_captures(table.captures, table.captures.categories)
+    categories = table.captures.categories
+    captures = open_captures(table.captures, categories, trained_models(methods, categories))
     _require_own_names(captures)
     fresh = freeze(table.captures, table.rules, captures)
     if not folder.protocol.is_file() or not any(folder.cells.glob("*/cell.json")):

@@ -87,7 +87,7 @@ def _run(
     methods = [_with_options(catalogue, name, table) for name in table.methods]
     if not methods:
         raise InputError("the table has no methods: give methods=[...]")
-    protocol, captures = open_protocol(table, folder)
+    protocol, captures = open_protocol(table, folder, methods)
     draws = selected_draws(table, protocol, options.quick)
     scenes = []
     with console.status("") as status:

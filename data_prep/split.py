@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import logging
 from collections import defaultdict
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from jaxtyping import Bool
 
 from extrap_train.errors import InputError
 
+LOG = logging.getLogger(__name__)
 HELD_OUT_EVERY = 5
 """A lone sequence holds out every fifth frame."""
 
@@ -48,16 +50,18 @@ def split_sequences(sequences: Sequence[str], test: Collection[str] | int) -> Sp
     gives: those whose names have the smallest hashes, and never more than half. Raises InputError
     where nothing is left to train on.
     """
+    if not isinstance(test, int):
+        _warn_of_unknown(sequences, test)
     members: dict[str, list[str]] = defaultdict(list)
     for sequence in sorted(sequences):
         members[sequence.split("/", 1)[0]].append(sequence)
     tested: list[str] = []
     lone: list[str] = []
     for category, names in members.items():
-        if len(names) == 1:
+        if len(names) == 1 and (isinstance(test, int) or not _chosen(names, test)):
             lone += names
         elif isinstance(test, int):
-            tested += sorted(names, key=_hash)[: min(test, len(names) // 2)]
+            tested += sorted(names, key=by_hash)[: min(test, len(names) // 2)]
         else:
             tested += _named(category, names, test)
     train = tuple(s for s in sorted(sequences) if s not in {*tested, *lone})
@@ -70,7 +74,7 @@ def held_out(frames: int) -> Bool[np.ndarray, "n"]:
 
 
 def _named(category: str, names: list[str], test: Collection[str]) -> list[str]:
-    chosen = [name for name in names if name in test or name.split("/", 1)[1] in test]
+    chosen = _chosen(names, test)
     if len(chosen) == len(names):
         raise InputError(
             f"{category}: all {len(names)} usable sequences are named as test sequences, none is "
@@ -84,5 +88,24 @@ def _named(category: str, names: list[str], test: Collection[str]) -> list[str]:
     return chosen
 
 
-def _hash(name: str) -> str:
+def _chosen(names: Collection[str], test: Collection[str]) -> list[str]:
+    return [name for name in names if name in test or name.split("/", 1)[1] in test]
+
+
+def _warn_of_unknown(sequences: Collection[str], test: Collection[str]) -> None:
+    known = {*sequences, *(name.split("/", 1)[1] for name in sequences)}
+    unknown = sorted(set(test) - known)
+    if unknown:
+        more = ", …" if len(unknown) > 3 else ""
+        LOG.warning(
+            "%d of %d named test sequences are not among the usable ones: %s%s",
+            len(unknown),
+            len(test),
+            ", ".join(unknown[:3]),
+            more,
+        )
+
+
+def by_hash(name: str) -> str:
+    """The order in which sequences, as `category/name`, become test sequences."""
     return hashlib.sha256(name.encode()).hexdigest()

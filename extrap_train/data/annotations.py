@@ -69,7 +69,7 @@ def _parsed(file: Path, parse: Callable[[Any, Path], T]) -> Iterator[T]:
             ) from None
         except InputError:
             raise
-        except (TypeError, ValueError, AttributeError) as error:
+        except (TypeError, ValueError, AttributeError, OverflowError) as error:
             raise InputError(
                 f"{file}: entry {index} is malformed ({error}); is this a CO3D annotation file?"
             ) from None
@@ -85,9 +85,12 @@ def _frame(entry: Any, file: Path) -> FrameAnnotation:
     ndc = (viewpoint or {}).get("intrinsics_format", "ndc_norm_image_bounds")
     if ndc not in NDC_FORMATS:
         raise ValueError(f"intrinsics_format {ndc!r} is none of {', '.join(NDC_FORMATS)}")
+    number = _typed(entry["frame_number"], int, "frame_number")
+    if abs(number) >= 2**63:
+        raise ValueError(f"frame_number {number}")
     return FrameAnnotation(
         sequence=_typed(entry["sequence_name"], str, "sequence_name"),
-        number=_typed(entry["frame_number"], int, "frame_number"),
+        number=number,
         image_path=_path(image["path"], file),
         size=(height, width),
         depth=_depth(entry.get("depth"), file),

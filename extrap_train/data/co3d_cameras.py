@@ -1,6 +1,7 @@
 """CO3D's annotated viewpoints to cameras, checked."""
 
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -36,8 +37,11 @@ def cameras_of(annotations: list[FrameAnnotation], file: Path) -> list[Camera]:
             height,
             width,
         )
-        require_sound(batch, names, file)
-        matrices = zip(members, batch.world_to_cam.float(), batch.intrinsics.float(), strict=True)
+        batch = replace(
+            batch, world_to_cam=batch.world_to_cam.float(), intrinsics=batch.intrinsics.float()
+        )
+        require_sound(batch, names, file)  # as it is used: what is finite in double may be none
+        matrices = zip(members, batch.world_to_cam, batch.intrinsics, strict=True)
         for index, world_to_cam, intrinsics in matrices:
             cameras[index] = Camera(world_to_cam, intrinsics, height, width)
     return [cameras[index] for index in range(len(annotations))]
@@ -52,7 +56,7 @@ def _stack(
 ) -> Float[Tensor, "n ..."]:
     try:
         values = np.array([viewpoint[key] for viewpoint in viewpoints], dtype=np.float64)
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         values = np.empty(0)
     if values.shape != (len(viewpoints), *shape):
         expected = " x ".join(map(str, shape))

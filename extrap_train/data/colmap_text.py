@@ -40,6 +40,12 @@ def read_text_images(file: Path) -> list[ModelImage]:
     while lines and not lines[-1][1].strip():
         lines.pop()
     images = []
+    for number, line in lines[1::2]:
+        if _is_image(line):
+            raise InputError(
+                f"{file}: line {number} is an image where the points of the one before are "
+                "expected, on a line that may be empty; export the model again"
+            )
     for number, line in lines[::2]:
         # A name may hold spaces.
         fields = line.split(maxsplit=9)
@@ -50,6 +56,20 @@ def read_text_images(file: Path) -> list[ModelImage]:
             raise _malformed(file, number) from None
         images.append(ModelImage(name, camera, pose[:4], pose[4:]))
     return images
+
+
+def _is_image(line: str) -> bool:
+    """Points are triples of numbers, so their tenth word is a number; an image's is its name."""
+    fields = line.split(maxsplit=9)
+    return len(fields) == 10 and not _is_number(fields[9].split()[0])
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _lines(file: Path) -> Iterator[tuple[int, str]]:

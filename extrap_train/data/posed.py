@@ -113,7 +113,7 @@ def _photograph(folder: Path, path: str, entry: dict[str, Any], file: Path) -> P
         ) from None
     except InputError:
         raise
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError, RuntimeError, ZeroDivisionError) as error:
         raise InputError(f"{file}: entry {path} is malformed ({error}); correct it") from None
 
 

@@ -9,6 +9,9 @@ from jaxtyping import Float, Shaped
 MAX_ZOOM = 4.0
 """A lens that needs more to fill the picture is beyond what a pinhole camera can show."""
 _BORDER_SAMPLES = 64
+_RAY_SAMPLES = 64
+_RAY_STEP = 1e-4
+"""Of a ray's length, over which the lens's radial derivative is taken."""
 _BISECTIONS = 24
 _OPENCV_CENTRE = 0.5
 """OpenCV puts the top-left pixel's centre at (0, 0), we at (0.5, 0.5)."""
@@ -98,7 +101,20 @@ def _fills(lens: Lens, pinhole: Lens, height: int, width: int) -> bool:
     )
     directions = (border - [pinhole.cx, pinhole.cy]) / [pinhole.fx, pinhole.fy]
     seen = distort(directions, lens)
-    return bool(((seen >= -1e-6) & (seen <= np.array([width, height]) + 1e-6)).all())
+    inside = ((seen >= -1e-6) & (seen <= np.array([width, height]) + 1e-6)).all()
+    return bool(inside) and not _folds(lens, directions)
+
+
+def _folds(lens: Lens, directions: Float[np.ndarray, "n 2"]) -> bool:
+    """Whether, on the way out to some direction, the lens shows things nearer to the middle again.
+
+    Beyond such a fold a polynomial says nothing of the lens, and two directions share a pixel.
+    """
+    ends = np.linspace(0, 1, _RAY_SAMPLES + 1)[1:]
+    rays = np.stack([ends - _RAY_STEP, ends])[..., None, None] * directions
+    before, after = distort(rays.reshape(-1, 2), lens).reshape(rays.shape)
+    moved = (after - before) / [lens.fx, lens.fy]
+    return bool(((moved * directions).sum(-1) <= 0).any())
 
 
 def _zoomed(lens: Lens, zoom: float) -> Lens:

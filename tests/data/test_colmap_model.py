@@ -11,6 +11,7 @@ from PIL import Image
 from two_views import epipolar_distances
 
 from extrap_train.data.colmap_model import read_model
+from extrap_train.data.colmap_text import read_text_images
 from extrap_train.errors import InputError
 from extrap_train.geometry.colmap import colmap_from_world_to_cam
 from extrap_train.views import Camera
@@ -206,3 +207,14 @@ def test_temple_features_lie_on_their_epipolar_lines(shared, tmp_path):
     distances = epipolar_distances(views[:2])
     assert len(distances) > 100
     assert np.median(distances) < 0.5
+
+
+def test_images_without_lines_of_points_are_not_lost(tmp_path):
+    """Every second one would be taken for the points of the one before."""
+    views = [view_at(angle) for angle in (0, 20, 40, 60)]
+    write_text(tmp_path, [Entry(f"{i}.png", view.camera) for i, view in enumerate(views)])
+    file = tmp_path / "images.txt"
+    images = [line for line in file.read_text().splitlines() if line.endswith(".png")]
+    file.write_text("\n".join(images) + "\n")
+    with pytest.raises(InputError, match=r"line 2 is an image where the points .* export"):
+        read_text_images(file)

@@ -198,6 +198,8 @@ def test_pictures_of_the_same_name_in_two_folders(folder):
         ({"fl_x": 0}, "is degenerate"),
         ({"fl_x": float("nan")}, "the lens of images/000.png is not finite"),
         ({"fl_x": "wide"}, "is malformed"),
+        ({"fl_x": 10**400}, "is malformed"),
+        ({"transform_matrix": [[10**400] * 4] * 4}, "is malformed"),
         ({"camera_model": "EQUIRECTANGULAR"}, "camera model 'EQUIRECTANGULAR' is none of"),
         ({"k1": 1e6}, "cannot be undone"),
         ({"w": 41}, "is 32 x 40 pixels"),

@@ -48,3 +48,14 @@ def test_a_lone_sequence_is_trained_and_tested_on() -> None:
 def test_the_hash_tells_splits_apart() -> None:
     first, second = (json.loads(split_sequences(NAMES, n).to_json()) for n in (4, 5))
     assert first["sha256"] != second["sha256"]
+
+
+def test_the_only_usable_sequence_is_not_trained_on_when_it_is_named_for_testing() -> None:
+    with pytest.raises(InputError, match="all 1 usable sequences are named as test sequences"):
+        split_sequences(["cup/0000"], {"0000"})
+    assert split_sequences(["cup/0000"], {"book/0000"}).lone == ("cup/0000",)
+
+
+def test_names_that_match_nothing_are_said(caplog: pytest.LogCaptureFixture) -> None:
+    split_sequences(NAMES[:20], {"0003", "cup/9999"})
+    assert "1 of 2 named test sequences are not among the usable ones: cup/9999" in caplog.text

@@ -73,3 +73,18 @@ def test_a_straight_lens_stays_as_it_is():
 def test_a_lens_that_nothing_is_left_of_is_refused():
     with pytest.raises(ValueError, match="cannot be undone"):
         Lens(50.0, 50.0, 120.0, 90.0, (90.0, 0.0, 0.0, 0.0)).pinhole(HEIGHT, WIDTH)
+
+
+def test_a_picture_ends_before_the_lens_folds():
+    """r(1 − 0.35 r²) turns back at r = 0.976; the corners of the unzoomed picture are at 1.05."""
+    lens = Lens(300.0, 300.0, 250.0, 190.0, (-0.35, 0.0, 0.0, 0.0))
+    pinhole = lens.pinhole(380, 500)
+    corner = np.hypot(250 / pinhole.fx, 190 / pinhole.fy)
+    assert corner < 1 / np.sqrt(3 * 0.35) + 1e-3
+    assert corner > 0.95
+
+
+def test_a_lens_that_folds_close_to_its_middle_cannot_be_undone():
+    lens = Lens(300.0, 300.0, 250.0, 190.0, (-40.0, 0.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="cannot be undone"):
+        lens.pinhole(380, 500)
