@@ -112,7 +112,7 @@ class VirtualPairs:
     ) -> None:
         self._views = _Inputs(views)
         self.most_references = most_references
-        self.all = virtual_references(views, most_references, virtual, seed)
+        self.all = virtual_references(views, virtual, seed)
         middle = virtual // 2
         self.held_out = self.all[middle::virtual]
         self.training = [pair for i, pair in enumerate(self.all) if i % virtual != middle]

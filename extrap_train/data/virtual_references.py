@@ -1,4 +1,4 @@
-"""References that nobody took: a scene's inputs seen from beside each of them."""
+"""References that nobody took: each of a scene's inputs as it looks from beside itself."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,19 +22,17 @@ class VirtualReference:
     """A view that stands beside one of the inputs, the query that it is a reference of."""
 
     view: View
-    """Warped from the inputs. Its depth is 0 where they do not reach; its image is filled there."""
+    """Warped from its query. Depth is 0 where that does not reach; the image is filled there."""
     query: int
     angle_rad: float
 
 
-def virtual_references(
-    views: Sequence[View], most_references: int, count: int, seed: int
-) -> list[VirtualReference]:
+def virtual_references(views: Sequence[View], count: int, seed: int) -> list[VirtualReference]:
     """`count` references beside each of the views (square, all of one size, with depth).
 
     They are turned about the scene's vertical by angles that are drawn evenly between 10 and 60
-    degrees, to both sides in turn, and see what up to `most_references` inputs nearest to them see.
-    Deterministic in the seed.
+    degrees, to both sides in turn, and see what their own view sees. The other views are left out:
+    where exposures differ, or depth is estimated, they teach to blur. Deterministic in the seed.
     """
     pivots, axis = _pivots(views), _vertical(views)
     rng = np.random.default_rng(seed)
@@ -44,7 +42,7 @@ def virtual_references(
         angles = _NEAREST_RAD + (_FARTHEST_RAD - _NEAREST_RAD) * shares
         sides = np.where(np.arange(count) % 2, 1.0, -1.0)
         cameras = turned_cameras(view.camera, pivots[query], axis, angles * sides)
-        batch, _ = query_batch(views, cameras, most_references, view.camera.height)
+        batch, _ = query_batch([view], cameras, 1, view.camera.height)
         warp = with_warp(batch).warp
         assert warp is not None
         images = fill_holes(warp.image, warp.mask).clamp(0, 1)

@@ -52,15 +52,15 @@ def test_one_view_has_no_pairs(virtual: int) -> None:
 
 
 def test_virtual_references_show_what_a_camera_would_see_from_there() -> None:
-    """Against the analytic scene: colours and depths where the inputs reach, nothing elsewhere."""
+    """Against the analytic scene: colours and depths where the query reaches, nothing elsewhere."""
     views = _around([0.0, 40.0, 80.0])
-    made = virtual_references(views, 3, 4, seed=0)
+    made = virtual_references(views, 4, seed=0)
     assert [reference.query for reference in made] == [0] * 4 + [1] * 4 + [2] * 4
     for reference in made:
         camera, depth = reference.view.camera, reference.view.depth
         assert depth is not None
         known = depth > 0
-        assert known.float().mean() > 0.4
+        assert known.float().mean() > 0.25
         exact = SPHERE_ON_PLANE.depth(camera)
         assert ((depth - exact).abs() < 0.03 * exact)[known].float().mean() > 0.95
         wrong = (reference.view.image - SPHERE_ON_PLANE.image(camera)).abs().mean(0)[known]
@@ -70,7 +70,7 @@ def test_virtual_references_show_what_a_camera_would_see_from_there() -> None:
 
 def test_they_stand_beside_their_query_by_the_angle_that_is_said() -> None:
     views = _around([0.0, 40.0, 80.0])
-    made = virtual_references(views, 3, 6, seed=1)
+    made = virtual_references(views, 6, seed=1)
     center = scene_center(stack_cameras([view.camera for view in views]))
     angles = np.rad2deg([reference.angle_rad for reference in made]).reshape(3, 6)
     assert (angles >= 10).all()
@@ -90,7 +90,7 @@ def test_views_that_look_past_each_other_turn_about_what_they_see_themselves() -
     scene = SPHERE_ON_PLANE
     cameras = [camera, type(camera)(beside, camera.intrinsics, 64, 64)]
     views = [View(scene.image(c), c, scene.depth(c)) for c in cameras]
-    for reference in virtual_references(views, 2, 2, seed=0):
+    for reference in virtual_references(views, 2, seed=0):
         view = views[reference.query]
         assert view.depth is not None
         pivot = view.camera.center + view.depth.median() * view.camera.forward
@@ -100,7 +100,7 @@ def test_views_that_look_past_each_other_turn_about_what_they_see_themselves() -
 
 
 def test_virtual_pairs_paint_every_photograph_but_from_no_reference_that_is_held_out() -> None:
-    views = _around([0.0, 40.0, 60.0, 180.0])
+    views = _around([0.0, 40.0, 60.0, 100.0])
     pairs = VirtualPairs(views, 3, 4, seed=0)
     assert pairs.counts() == {"all": 16, "trained": 12}
     held_out = pairs.held_out_batch()
