@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from scenes import SPHERE_ON_PLANE, orbit_camera
+from torch.nn import functional
 
 from extrap_train.data.sequences import Frame, Sequence
 from extrap_train.errors import InputError
@@ -49,6 +50,15 @@ def ring(
 def even(count: int, span_deg: float = 360.0) -> np.ndarray:
     """Azimuths in equal steps."""
     return np.arange(count) * span_deg / count
+
+
+def walls(count: int) -> list[View]:
+    """Views of 64² with depth: walls of smooth noise seen from an arc, 25 degrees apart."""
+    cameras = ring(np.arange(count) * 25.0).squared(64)
+    images = torch.rand(count, 3, 8, 8, generator=torch.Generator().manual_seed(0))
+    smooth = functional.interpolate(images, size=(64, 64), mode="bilinear")
+    depth = torch.full((64, 64), 3.0)
+    return [View(smooth[i], cameras[i], depth, name=f"v{i}") for i in range(count)]
 
 
 def capture(

@@ -15,28 +15,15 @@ import pandas as pd
 import pytest
 import torch
 from safetensors.torch import load_file
+from tiny_job import TINY
 
 from extrap_train.diffusion.checkpoint import load_model
 
-_TINY = [
-    "category=hydrant",
-    "data.train_sequences=2",
-    "data.test_sequences=1",
-    "data.frames=12",
-    "data.image_size=32",
-    "model.start=null",
-    "model.image_size=16",
-    "prep.image_size=32",
-    "prep.max_gap_deg=60",
-    "model.octaves=2",
-    "model.unet.channels=[16,32]",
-    "model.unet.attention_levels=[false,true]",
-    "model.unet.heads=2",
-    "model.unet.token_width=16",
+_OPTIONS = [
+    *TINY,
     "trainer.steps=12",
     "trainer.checkpoint_every=3",
     "trainer.validate_every=6",
-    "trainer.batch_size=2",
     "trainer.power_averages=true",
     "validation.examples=4",
     "validation.pictures=2",
@@ -45,7 +32,7 @@ _TINY = [
 
 
 def _start(output: Path, *more: str) -> "subprocess.Popen[bytes]":
-    command = [sys.executable, "-m", "extrap_train", *_TINY, f"output={output}", *more]
+    command = [sys.executable, "-m", "extrap_train", *_OPTIONS, f"output={output}", *more]
     environment = os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     with (output / "log.txt").open("wb") as log:
         return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)

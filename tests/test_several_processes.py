@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import pandas as pd
 import pytest
 from hydra.types import RunMode
+from tiny_job import TINY
 
 from extrap_train import cli
 from extrap_train.config import TrainConfig
@@ -17,24 +18,10 @@ from extrap_train.errors import InputError
 from extrap_train.processes import Opening, announce, join
 
 _OPTIONS = [
-    "category=hydrant",
-    "data.train_sequences=2",
-    "data.test_sequences=1",
-    "data.frames=12",
-    "data.image_size=32",
-    "model.start=null",
-    "model.image_size=16",
-    "prep.image_size=32",
-    "prep.max_gap_deg=60",
-    "model.octaves=2",
-    "model.unet.channels=[16,32]",
-    "model.unet.attention_levels=[false,true]",
-    "model.unet.heads=2",
-    "model.unet.token_width=16",
+    *TINY,
     "trainer.steps=2",
     "trainer.checkpoint_every=2",
     "trainer.validate_every=2",
-    "trainer.batch_size=2",
     "trainer.accelerator=cpu",
     "validation.examples=5",
     "validation.batch_size=2",

@@ -5,26 +5,16 @@ from pathlib import Path
 
 import pytest
 from orbits import capture, even, ring
+from prepared import prepared_captures
 
-from data_prep.build import prepare
-from extrap_train.config import PrepConfig
 from extrap_train.data.sequences import Sequence
-from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError
 from extrap_train.runs import RunFolder, note_data
 from extrap_train.trained_on import TrainedOn
 
 
 def trained_on(folder: Path, sequences: list[Sequence], test_names: set[str]) -> TrainedOn:
-    prepared = prepare(
-        sequences,
-        DatasetDepth(),
-        PrepConfig(image_size=16),
-        test_names=test_names,
-        folder=folder,
-        progress=False,
-        source={"name": "co3d"},
-    )
+    prepared = prepared_captures(folder, sequences, test_names)
     return TrainedOn.of(["cup"], [prepared])
 
 

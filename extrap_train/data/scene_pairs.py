@@ -73,17 +73,17 @@ class ScenePairs:
         """See `AdaptationPairs.training_batch`; each has one to `most_references` references."""
         drawn = _drawn(len(self.training), size, rng)
         counts = rng.integers(1, self.most_references + 1, size)
-        return self._batch(
-            [
-                self._example(self.training[place], int(count), rng)
-                for place, count in zip(drawn, counts, strict=True)
-            ]
-        )
+        examples = [
+            self._example(self.training[place], int(count), rng)
+            for place, count in zip(drawn, counts, strict=True)
+        ]
+        return collate(examples, self.most_references)
 
     def held_out_batch(self) -> PairBatch:
         """The held-out pair, with all the references that it can have."""
         rng = np.random.default_rng(0)
-        return self._batch([self._example(self.held_out, self.most_references, rng)])
+        example = self._example(self.held_out, self.most_references, rng)
+        return collate([example], self.most_references)
 
     def _example(self, pair: Pair, count: int, rng: np.random.Generator) -> Example:
         query, first = pair
@@ -91,9 +91,6 @@ class ScenePairs:
         angles = self._views.angles_rad
         further = extra_references(angles, query, first, count, rng, places)
         return self._views.example(query, [], [first, *further])
-
-    def _batch(self, examples: list[Example]) -> PairBatch:
-        return collate(examples, self.most_references)
 
 
 class VirtualPairs:
@@ -124,12 +121,14 @@ class VirtualPairs:
     def training_batch(self, size: int, rng: np.random.Generator) -> PairBatch:
         """See `AdaptationPairs.training_batch`; inputs farther than it stand beside a reference."""
         drawn = _drawn(len(self.training), size, rng)
-        return self._batch([self._example(self.training[place], rng) for place in drawn])
+        examples = [self._example(self.training[place], rng) for place in drawn]
+        return collate(examples, self.most_references)
 
     def held_out_batch(self) -> PairBatch:
         """The held-out reference of every view."""
         rng = np.random.default_rng(0)
-        return self._batch([self._example(pair, rng) for pair in self.held_out])
+        examples = [self._example(pair, rng) for pair in self.held_out]
+        return collate(examples, self.most_references)
 
     def _example(self, pair: VirtualReference, rng: np.random.Generator) -> Example:
         angles = self._views.angles_rad[pair.query]
@@ -138,9 +137,6 @@ class VirtualPairs:
         count = int(rng.integers(0, min(self.most_references - 1, len(behind)) + 1))
         further = sorted(rng.permutation(behind)[:count].tolist(), key=lambda view: angles[view])
         return self._views.example(pair.query, [pair.view], further)
-
-    def _batch(self, examples: list[Example]) -> PairBatch:
-        return collate(examples, self.most_references)
 
 
 def _drawn(count: int, size: int, rng: np.random.Generator) -> list[int]:

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,13 +16,10 @@ from extrap_train.config import LoraConfig, SamplerConfig
 from extrap_train.data.module import with_warp
 from extrap_train.data.scene_pairs import AdaptationPairs
 from extrap_train.diffusion.conditioning import Conditioning
-from extrap_train.diffusion.loss import Anchor, diffusion_loss, prediction_errors
+from extrap_train.diffusion.loss import Anchor, Unchanged, diffusion_loss, prediction_errors
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.schedule import solver_of
 from extrap_train.views import PairBatch, combine
-
-Unchanged = Callable[[], AbstractContextManager[None]]
-"""In its context the adapter has no effect."""
 
 _LEVELS = 4
 """Of noise, at most, at which what is held out is measured; a long schedule is taken in strides."""

@@ -14,6 +14,9 @@ from extrap_train.diffusion.conditioning import Conditioning
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.views import PairBatch
 
+Unchanged = Callable[[], AbstractContextManager[None]]
+"""In its context a model that is adapted is as it was before."""
+
 
 @dataclass(frozen=True)
 class Anchor:
@@ -21,8 +24,7 @@ class Anchor:
 
     known: Float[Tensor, "b h w"]
     """1 where the truth is learnt, 0 where the model is to stay as it was."""
-    unchanged: Callable[[], AbstractContextManager[None]]
-    """In its context the model is as it was."""
+    unchanged: Unchanged
 
 
 def diffusion_loss(

@@ -1,28 +1,18 @@
-"""What a model is adapted to a scene with: never the query that it is measured on, and no reference
-that sees what no input sees.
+"""What a model is adapted to a scene with: nothing that it is measured on, and no reference that
+sees what no input sees.
 """
 
 import numpy as np
 import pytest
 import torch
-from orbits import ring
+from orbits import walls
 from scenes import SPHERE_ON_PLANE, orbit_camera
-from torch import nn
 
 from extrap_train.data.scene_pairs import ScenePairs, VirtualPairs, adaptation_pairs
 from extrap_train.data.virtual_references import virtual_references
 from extrap_train.errors import InputError
 from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
 from extrap_train.views import View, stack_cameras
-
-
-def _walls(count: int) -> list[View]:
-    """Walls of smooth noise seen from an arc, 25 degrees apart."""
-    cameras = ring(torch.arange(count).numpy() * 25.0).squared(64)
-    images = torch.rand(count, 3, 8, 8, generator=torch.Generator().manual_seed(0))
-    smooth = nn.functional.interpolate(images, size=(64, 64), mode="bilinear")
-    depth = torch.full((64, 64), 3.0)
-    return [View(smooth[i], cameras[i], depth, name=f"v{i}") for i in range(count)]
 
 
 def _around(azimuths_deg: list[float], size: int = 64) -> list[View]:
@@ -33,7 +23,7 @@ def _around(azimuths_deg: list[float], size: int = 64) -> list[View]:
 
 
 def test_the_pairs_are_all_ordered_ones_and_the_held_out_query_is_never_a_target() -> None:
-    pairs = ScenePairs(_walls(4), 3)
+    pairs = ScenePairs(walls(4), 3)
     assert len(set(pairs.all)) == len(pairs.all) == 12
     query, reference = pairs.held_out
     assert abs(query - reference) in (2, 3), "50 or 75 degrees, nearest to 60"
@@ -41,14 +31,14 @@ def test_the_pairs_are_all_ordered_ones_and_the_held_out_query_is_never_a_target
     assert pairs.counts() == {"all": 12, "trained": 9}
     batch = pairs.held_out_batch()
     assert len(batch.image) == 1
-    torch.testing.assert_close(batch.image[0], _walls(4)[query].image)
-    torch.testing.assert_close(batch.reference_images[0, 0], _walls(4)[reference].image)
+    torch.testing.assert_close(batch.image[0], walls(4)[query].image)
+    torch.testing.assert_close(batch.reference_images[0, 0], walls(4)[reference].image)
 
 
 @pytest.mark.parametrize("virtual", [0, 4])
 def test_one_view_has_no_pairs(virtual: int) -> None:
     with pytest.raises(InputError, match="1 input view, and pairs need at least two"):
-        adaptation_pairs(_walls(1), 3, virtual, seed=0)
+        adaptation_pairs(walls(1), 3, virtual, seed=0)
 
 
 def test_virtual_references_show_what_a_camera_would_see_from_there() -> None:

@@ -9,7 +9,7 @@ import peft
 import pytest
 import torch
 from lightning.fabric import Fabric
-from orbits import ring
+from orbits import walls
 from torch import Tensor, nn
 
 from extrap_train.config import LoraConfig, ModelConfig, SamplerConfig
@@ -18,9 +18,9 @@ from extrap_train.diffusion.adaptation import Adaptation, adapt
 from extrap_train.diffusion.lora import add_adapter, load_adapter, save_adapter
 from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.model import ExtrapolationModel
-from extrap_train.diffusion.sampler import sample_views, view_generator
+from extrap_train.diffusion.sampler import view_generator
 from extrap_train.errors import InputError
-from extrap_train.views import PairBatch, View
+from extrap_train.views import PairBatch
 
 OPTIONS = LoraConfig(rank=2, convolutions=True, steps=12, validate_every=4, batch_size=4)
 
@@ -127,15 +127,6 @@ def test_an_adapter_of_another_kind_is_refused_and_leaves_the_model_alone(
     assert list(model.state_dict()) == names
 
 
-def _views(count: int) -> list[View]:
-    """Bumpy walls seen from an arc, at the size that warps are made at."""
-    cameras = ring(torch.arange(count).numpy() * 25.0).squared(64)
-    images = torch.rand(count, 3, 8, 8, generator=torch.Generator().manual_seed(0))
-    smooth = nn.functional.interpolate(images, size=(64, 64), mode="bilinear")
-    depth = torch.full((64, 64), 3.0)
-    return [View(smooth[i], cameras[i], depth, name=f"v{i}") for i in range(count)]
-
-
 def _adapt(
     config: ModelConfig, seconds: float = 1e9, **options: Any
 ) -> tuple[ExtrapolationModel, Adaptation]:
@@ -145,7 +136,7 @@ def _adapt(
     done = adapt(
         model,
         adapter,
-        adaptation_pairs(_views(3), 3, chosen.virtual_references, seed=0),
+        adaptation_pairs(walls(3), 3, chosen.virtual_references, seed=0),
         chosen,
         SamplerConfig(),
         seconds=seconds,
@@ -191,7 +182,7 @@ def test_a_long_schedule_and_many_held_out_pairs_are_measured_a_batch_at_a_time(
     options = replace(OPTIONS, batch_size=2, steps=1, virtual_references=5)
     adapter = add_adapter(model, options, seed=0)
     sampler = SamplerConfig(steps=50)
-    pairs = adaptation_pairs(_views(3), 3, options.virtual_references, seed=0)
+    pairs = adaptation_pairs(walls(3), 3, options.virtual_references, seed=0)
     fabric = Fabric(accelerator="cpu", devices=1)
     adapt(model, adapter, pairs, options, sampler, seconds=1e-6, seed=0, fabric=fabric)
     assert max(sizes) == 2
@@ -217,7 +208,7 @@ def test_the_null_condition_is_trained_where_sampling_asks_for_it(
     model = _model(config)
     options = replace(OPTIONS, steps=1)
     adapter = add_adapter(model, options, seed=0)
-    pairs = adaptation_pairs(_views(2), 3, 2, seed=0)
+    pairs = adaptation_pairs(walls(2), 3, 2, seed=0)
     fabric = Fabric(accelerator="cpu", devices=1)
     sampler = SamplerConfig(guidance=guidance)
     adapt(model, adapter, pairs, options, sampler, seconds=1e-6, seed=0, fabric=fabric)

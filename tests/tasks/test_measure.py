@@ -6,19 +6,17 @@ from types import ModuleType
 
 import pytest
 from orbits import capture, even, ring
+from prepared import prepared_captures
 
-from data_prep.build import prepare
 from extrap_train.config import (
     CategoryConfig,
     Co3dConfig,
     DatasetDepthConfig,
     FlowMatcherConfig,
     ModelConfig,
-    PrepConfig,
     TrainConfig,
 )
 from extrap_train.data.store import PreparedData
-from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError
 from extrap_train.runs import RunFolder
 from extrap_train.tasks import average, validate
@@ -26,15 +24,8 @@ from extrap_train.trained_on import TrainedOn
 
 
 def _prepared(folder: Path, test_names: set[str]) -> PreparedData:
-    return prepare(
-        [capture(ring(even(24)), f"{index:04d}") for index in range(3)],
-        DatasetDepth(),
-        PrepConfig(image_size=16),
-        test_names=test_names,
-        folder=folder,
-        progress=False,
-        source={"name": "co3d"},
-    )
+    captures = [capture(ring(even(24)), f"{index:04d}") for index in range(3)]
+    return prepared_captures(folder, captures, test_names)
 
 
 @pytest.fixture
