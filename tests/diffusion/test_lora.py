@@ -18,7 +18,7 @@ from extrap_train.diffusion.adaptation import Adaptation, adapt
 from extrap_train.diffusion.lora import add_adapter, load_adapter, save_adapter
 from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.model import ExtrapolationModel
-from extrap_train.diffusion.sampler import view_generator
+from extrap_train.diffusion.sampler import sample_views, view_generator
 from extrap_train.errors import InputError
 from extrap_train.views import PairBatch
 
