@@ -23,7 +23,7 @@ LEAST_KNOWN_SHARE = 0.25
 """Of the finer depths under a pixel, for it to have one."""
 MOST_UNUSABLE_SHARE = 0.1
 """Of a sequence's frames, beyond which the whole sequence is not trusted."""
-METHOD = 1
+METHOD = 2
 """Raised whenever the same photographs give other frames."""
 LOG = logging.getLogger(__name__)
 

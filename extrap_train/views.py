@@ -12,6 +12,8 @@ from torch import Tensor
 from torch.nn import functional
 
 T = TypeVar("T")
+_SAME_SURFACE = 0.02
+"""Relative difference of depth below which a resampled map is interpolated."""
 
 
 def combine(parts: Sequence[T], join: Callable[[Sequence[Tensor]], Tensor]) -> T:
@@ -133,13 +135,13 @@ class View:
         )
 
     def resized(self, height: int, width: int) -> "View":
-        """The view resampled: colours and mask by area, depth by the nearest pixel."""
+        """The view resampled: colours and mask by area, depth on its surfaces."""
         size = (height, width)
         return replace(
             self,
             image=_resample_area(self.image, size).clamp(0, 1),
             camera=self.camera.resized(height, width),
-            depth=None if self.depth is None else _resample_nearest(self.depth[None], size)[0],
+            depth=None if self.depth is None else resample_surfaces(self.depth[None], size)[0],
             mask=None
             if self.mask is None
             else _resample_area(self.mask[None], size)[0].clamp(0, 1),
@@ -160,10 +162,18 @@ def _resample_area(
     )[0]
 
 
-def _resample_nearest(
-    image: Float[Tensor, "c h w"], size: tuple[int, int]
+def resample_surfaces(
+    maps: Float[Tensor, "c h w"], size: tuple[int, int]
 ) -> Float[Tensor, "c h2 w2"]:
-    return functional.interpolate(image[None], size, mode="nearest-exact")[0]
+    """A depth map, the first of `maps`, and what lies on its surfaces, at another size.
+
+    Interpolated on a surface, which leaves it where it was; by the nearest pixel at its edges, so
+    that no depth is invented between two of them. Depth 0 is unknown.
+    """
+    nearest = functional.interpolate(maps[None], size, mode="nearest-exact")[0]
+    smooth = functional.interpolate(maps[None], size, mode="bilinear", align_corners=False)[0]
+    same = (smooth[0] - nearest[0]).abs() < _SAME_SURFACE * nearest[0]
+    return torch.where(same, smooth, nearest)
 
 
 @dataclass(frozen=True)

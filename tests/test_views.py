@@ -4,11 +4,9 @@ from dataclasses import replace
 
 import pytest
 import torch
-from scenes import Scene, orbit_camera, plane, sphere
+from scenes import Scene, orbit_camera, plane
 
 from extrap_train.views import Camera, View, stack_cameras
-
-SCENE = Scene((sphere(1.0), plane(-2.5, (0.0, -1.0, 0.0))))
 
 
 @pytest.fixture(scope="module")
@@ -42,10 +40,9 @@ def test_a_resized_view_is_what_the_resized_camera_sees(view, size):
     inner = (..., slice(2, -2), slice(2, -2))
     # Half a pixel of shift would cost more than 0.01 on average.
     assert (resized.image - expected.image)[inner].abs().mean() < 2e-3
-    # Depth is the nearest pixel's: off by up to half a pixel of slope.
     relative = (resized.depth / expected.depth - 1)[inner]
-    assert relative.abs().max() < 0.02
-    assert relative.mean().abs() < 4e-3
+    # A quarter of a pixel of shift, which the nearest pixel costs at half the size, is 3e-3.
+    assert relative.abs().max() < 1e-3
 
 
 def test_squared_is_the_centred_square(view):
@@ -67,11 +64,15 @@ def test_a_crop_beyond_the_image_is_refused(view):
         view.cropped(100, 0, 40, 40)
 
 
-def test_depth_edges_stay_edges():
+@pytest.mark.parametrize("size", [(32, 32), (40, 40), (100, 90)])
+def test_depth_edges_stay_edges(size):
     camera = orbit_camera(0, size=64)
-    depth = SCENE.depth(camera)
-    smaller = View(SCENE.image(camera), camera, depth).resized(40, 40)
-    assert torch.isin(smaller.depth, depth).all()
+    depth = torch.full((64, 64), 5.0)
+    depth[10:37, 21:50] = 2  # a card before a wall
+    depth[50:53] = 0  # and unknown there
+    resized = View(torch.zeros(3, 64, 64), camera, depth).resized(*size).depth
+    off = (resized[..., None] - torch.tensor([0.0, 2.0, 5.0])).abs().amin(-1)
+    assert (off <= 0.02 * resized).all()
 
 
 def test_only_cameras_of_one_size_can_be_stacked():
