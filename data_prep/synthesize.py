@@ -10,7 +10,8 @@ import torch
 from tqdm import tqdm
 
 from extrap_train.config import SyntheticConfig
-from extrap_train.data.co3d import FRAME_ANNOTATIONS
+from extrap_train.data.annotations import read_sequence_annotations
+from extrap_train.data.co3d import FRAME_ANNOTATIONS, SEQUENCE_ANNOTATIONS
 from extrap_train.data.co3d_writer import write_annotations, write_frame, write_sequence
 from extrap_train.data.files import partial_beside, put_in_place, remove_partial, write_whole
 from extrap_train.data.synthetic import (
@@ -28,6 +29,8 @@ LOOK = 2
 """Raised whenever the same options give other pictures, so that old ones are not mixed with new."""
 RECORD = "synthetic.json"
 """In a sequence's folder: the options it was made with, and its annotations."""
+STAMP = "synthetic_annotations.json"
+"""Beside the annotations: which sequences they list, made with which options."""
 CLOUD_POINTS = 20_000
 
 
@@ -56,8 +59,8 @@ def synthesize(config: SyntheticConfig, category: str, root: Path, launcher: Lau
 
     Sequences 0 … `test_sequences` − 1 are the test split; asking for more training sequences keeps
     every sequence there is. Files are the same, bit for bit, with any launcher. Sequences made with
-    other options are replaced, with a message. Raises InputError for an unknown category and where
-    the disk is full.
+    other options are replaced, with a message. Raises InputError for an unknown category, where
+    the disk is full, and, before anything is written, where anything that is not of ours lies.
     """
     options = {
         "look": LOOK,
@@ -67,6 +70,7 @@ def synthesize(config: SyntheticConfig, category: str, root: Path, launcher: Lau
     }
     count = config.test_sequences + config.train_sequences
     jobs = [_Job(root, category, index, options) for index in range(count)]
+    _require_ours(root / category, jobs)
     states = [_state(job) for job in jobs]
     missing = [job for job, state in zip(jobs, states, strict=True) if state != "ready"]
     _announce(category, root, states)
@@ -76,9 +80,45 @@ def synthesize(config: SyntheticConfig, category: str, root: Path, launcher: Lau
     _annotate(root, category, [record for record in records if record], config.test_sequences)
 
 
+def _require_ours(folder: Path, jobs: list[_Job]) -> None:
+    """Raise InputError where a category's folder, or one in it to be replaced, is not ours."""
+    there = _entries(folder)
+    made = {path.name for path in there if (path / RECORD).exists()}
+    if not made and not (folder / STAMP).exists():
+        foreign = there[:1]
+    else:
+        places = {job.folder for job in jobs}
+        foreign = [path for path in there if path in places and path.name not in made]
+        foreign += _foreign_annotations(folder, made)
+    if foreign:
+        raise InputError(
+            f"{folder}: is no folder of synthetic captures, for it holds {foreign[0].name}, and is "
+            "left as it is; did you mean data=co3d? For synthetic captures give another data.root"
+        )
+
+
+def _entries(folder: Path) -> list[Path]:
+    """What lies in a folder by name, but for locks, what is being written, and empty folders."""
+    if not folder.is_dir():
+        return []
+    seen = [path for path in sorted(folder.iterdir()) if not path.name.startswith(".")]
+    return [path for path in seen if not path.is_dir() or any(path.iterdir())]
+
+
+def _foreign_annotations(folder: Path, made: set[str]) -> list[Path]:
+    """The annotations, if they list a sequence that no folder of ours stands or stood for."""
+    file = folder / SEQUENCE_ANNOTATIONS
+    try:
+        listed = read_sequence_annotations(file)
+    except InputError:  # not there yet, or damaged: written anew
+        return []
+    ours = made | {name for name in listed if name.isdecimal() and not (folder / name).exists()}
+    return [] if ours.issuperset(listed) else [file]
+
+
 def _state(job: _Job) -> str:
     """`ready`, `missing`, or `outdated`: made with other options."""
-    if not job.folder.exists():
+    if not (job.folder / RECORD).exists():
         return "missing"
     record = _read_record(job.folder)
     return "ready" if record is not None and record["options"] == job.options else "outdated"
@@ -141,7 +181,7 @@ def _annotate(
     root: Path, category: str, records: list[dict[str, Any]], test_sequences: int
 ) -> None:
     """Annotation files of these sequences; left alone where they list the same ones already."""
-    stamp = root / category / "synthetic_annotations.json"
+    stamp = root / category / STAMP
     content = json.dumps([[r["sequence"], r["options"]] for r in records] + [test_sequences])
     if (root / category / FRAME_ANNOTATIONS).exists() and _text(stamp) == content:
         return

@@ -131,17 +131,21 @@ def put_in_place(made: Path, folder: Path, is_wanted: Callable[[Path], bool]) ->
     """Let what was `made` become `folder`, on the same file system, once it is on the disk.
 
     What lay there is replaced, unless it is what is wanted: then another writer has come first, and
-    its folder stays, so that nobody who reads it by now is disturbed.
+    its folder stays, so that nobody who reads it by now is disturbed. Whenever this process is
+    killed, the folder is there whole, as it was or as it is now, or not at all.
     """
     for path in (*made.rglob("*"), made):
         _sync(path)
     with FileLock(folder.parent / ".lock"):
         if is_wanted(folder):
             return
+        replaced = partial_beside(folder.with_name(f"{folder.name}.replaced"))
         if folder.exists():
-            shutil.rmtree(folder)
+            shutil.rmtree(replaced, ignore_errors=True)  # of an earlier process of the same number
+            folder.rename(replaced)
         made.rename(folder)
         _sync(folder.parent)
+    shutil.rmtree(replaced, ignore_errors=True)
 
 
 def remove_partial(folder: Path) -> None:

@@ -111,6 +111,25 @@ def test_a_folder_is_there_whole_or_not_at_all(tmp_path):
     assert {path.name for path in folder.parent.iterdir()} == {"one", ".lock"}
 
 
+def test_a_folder_that_is_being_replaced_is_never_half_there(tmp_path, monkeypatch):
+    folder = tmp_path / "one"
+    write_number(folder, 1)
+    (folder / "more").touch()
+
+    def killed_within(path, **options):
+        next(Path(path).iterdir(), folder).unlink()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(shutil, "rmtree", killed_within)
+    with pytest.raises(KeyboardInterrupt):
+        write_number(folder, 2)
+    seen = {path.name: path.read_text() for path in folder.iterdir()}
+    assert seen in ({"number": "1", "more": ""}, {"number": "2"})
+    monkeypatch.undo()
+    remove_partial(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"one", ".lock"}
+
+
 def test_who_comes_second_leaves_the_first_ones_folder(tmp_path):
     folder = tmp_path / "one"
     write_number(folder, 1)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from captures import write_capture
 
 from data_prep.gallery import gallery
 from data_prep.synthesize import synthesize
@@ -71,9 +72,51 @@ def test_only_what_is_missing_is_rendered(root, made, capsys):
 
 
 def test_what_a_killed_run_left_behind_is_made_anew(root, made):
-    (root / "apple" / "0002" / "synthetic.json").unlink()
+    category = root / "apple"
+    (category / "0002" / "synthetic.json").write_bytes(b'{"options": {"lo')
+    shutil.rmtree(category / "0001")
+    for file in ("synthetic_annotations.json", "frame_annotations.jgz"):
+        (category / file).unlink()
     synthesize(SMALL, "apple", root, LocalLauncher(1))
     assert contents(root) == contents(made)
+
+
+def test_a_run_that_was_killed_before_its_first_sequence_goes_on(tmp_path, made):
+    (tmp_path / "apple" / ".0000.elsewhere-7.tmp" / "apple" / "0000").mkdir(parents=True)
+    (tmp_path / "apple" / ".lock").touch()
+    (tmp_path / "apple" / "0001").mkdir()
+    synthesize(SMALL, "apple", tmp_path, LocalLauncher(1))
+    shutil.rmtree(tmp_path / "apple" / ".0000.elsewhere-7.tmp")
+    assert contents(tmp_path) == contents(made)
+
+
+@pytest.mark.parametrize("names", [("106_12648_23157", "one"), ("0000", "0001")])
+def test_a_download_is_left_as_it_is(tmp_path, names):
+    write_capture(tmp_path, names, frames=1)
+    before = contents(tmp_path)
+    with pytest.raises(InputError, match=r"cup: is no folder of synthetic captures.*data=co3d\?"):
+        synthesize(SMALL, "cup", tmp_path, LocalLauncher(1))
+    assert contents(tmp_path) == before
+
+
+def test_a_folder_of_somebody_elses_is_left_as_it_is(root):
+    shutil.rmtree(root / "apple" / "0001")
+    (root / "apple" / "0001").mkdir()
+    (root / "apple" / "0001" / "notes.txt").write_text("mine")
+    before = contents(root)
+    for config in (SMALL, replace(SMALL, frames=2)):
+        with pytest.raises(InputError, match=r"for it holds 0001, and is left as it is"):
+            synthesize(config, "apple", root, LocalLauncher(1))
+    assert contents(root) == before
+
+
+def test_a_download_that_was_unpacked_over_synthetic_captures_is_left_as_it_is(root):
+    write_capture(root, ("106_12648_23157",), frames=1)
+    shutil.copytree(root / "cup", root / "apple", dirs_exist_ok=True)
+    before = contents(root)
+    with pytest.raises(InputError, match=r"for it holds sequence_annotations.jgz"):
+        synthesize(replace(SMALL, train_sequences=3), "apple", root, LocalLauncher(1))
+    assert contents(root) == before
 
 
 def test_half_of_a_rendering_is_removed_but_not_a_living_ones(root):
