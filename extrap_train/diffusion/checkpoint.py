@@ -165,10 +165,13 @@ def _saved_config(folder: Path) -> ModelConfig:
         raise InputError(f"{file}: no model of this project ({reason})") from None
 
 
-def load_weights(model: ExtrapolationModel, path: Path, option: str = "model.start") -> None:
+def load_weights(
+    model: ExtrapolationModel, path: Path, option: str = "model.start", *, to_train: bool = True
+) -> None:
     """Fill a model with the weights of a folder or of a published checkpoint that `option` named.
 
-    Names and shapes must be the same, but where one family starts from another (`transfer`).
+    Names and shapes must be the same, but where one family starts from another (`transfer`): its
+    new channels then say nothing yet, so that only what is `to_train` may.
     """
     networks = model.parts()
     wanted = {
@@ -183,6 +186,8 @@ def load_weights(model: ExtrapolationModel, path: Path, option: str = "model.sta
         raise file.refusal("has no convolution conv_in that the denoiser begins with")
     family = _family(path, file, first)
     if family != model.config.family:
+        if not to_train:
+            raise file.refusal(_untrained(family, first, model.config))
         _take_over(found, family, model)
     elif model.config.geometry and _lacks_geometry(path, model.config):
         channels = model.unet.conv_in.weight.shape[1]
@@ -210,6 +215,15 @@ def _lacks_geometry(path: Path, config: ModelConfig) -> bool:
         return False
     saved = _saved_config(path)
     return not saved.geometry and saved.octaves == config.octaves
+
+
+def _untrained(family: str, conv_in: Tensor, config: ModelConfig) -> str:
+    said = (
+        f"is of the family {family} ({conv_in.shape[1]} input channels), but model={config.name} "
+        f"is of {config.family} and was never trained: give model={family}"
+    )
+    is_a_start = family == "zeronvs"  # of a VAE's latents, none is narrowed
+    return said + (", or train from it (task=category model.start=FILE)" if is_a_start else "")
 
 
 def _take_over(
@@ -247,14 +261,24 @@ def initial_model(config: ModelConfig) -> ExtrapolationModel:
                 f"{SOURCES}"
             )
         return ExtrapolationModel(config)
-    return model_from(config.start, config, "model.start")
+    return _filled(config.start, config, "model.start", to_train=True)
 
 
-def model_from(weights: str, config: ModelConfig, option: str) -> ExtrapolationModel:
-    """The configured model with the weights that `option` names, as `initial_model` knows them."""
+def published_model(weights: str, config: ModelConfig) -> ExtrapolationModel:
+    """The model that `config` describes as a published checkpoint has it, to be used as it is.
+
+    Raises InputError for weights of another family: they are a start, and no model.
+    """
+    return _filled(weights, config, "weights", to_train=False)
+
+
+def _filled(
+    weights: str, config: ModelConfig, option: str, *, to_train: bool
+) -> ExtrapolationModel:
     with torch.device("meta"):
         model = ExtrapolationModel(config)
     given = Path(weights)
     path = given if is_compact(given) else weights_at(given)
-    load_weights(model, packaged_weights(weights, option) if path is None else path, option)
+    found = packaged_weights(weights, option) if path is None else path
+    load_weights(model, found, option, to_train=to_train)
     return model

@@ -13,7 +13,7 @@ from extrap_train.data.photographs import CATEGORY
 from extrap_train.data.scene import open_scene
 from extrap_train.data.sequences import Frame, Sequence
 from extrap_train.depth.build import depth_source
-from extrap_train.diffusion.checkpoint import is_own, load_model, model_from
+from extrap_train.diffusion.checkpoint import is_own, load_model, published_model
 from extrap_train.diffusion.lora import load_adapter
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.packaged import packaged_name, packaged_names, packaged_weights
@@ -111,7 +111,7 @@ def open_model(
     if is_own(path):
         model = load_model(path)
     elif config is not None:
-        model = model_from(weights, config, "weights")
+        model = published_model(weights, config)
     else:
         raise InputError(
             f"weights={weights}: is no model folder of this project; a published checkpoint needs "

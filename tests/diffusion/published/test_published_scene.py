@@ -85,3 +85,35 @@ def test_of_another_size_than_the_model_it_says_which_option(
     message = str(stopped.value)
     assert f"error: {path}: lacks" in message
     assert "give weights=FILE" in message
+
+
+@pytest.mark.parametrize(
+    ("found", "asked"),
+    [("zeronvs", "ours"), ("zeronvs", "megascenes"), ("megascenes", "ours")],
+)
+def test_another_family_is_a_start_and_paints_nothing(
+    command, references: dict[str, Reference], tmp_path: Path, found: str, asked: str
+) -> None:
+    """Widened, it would paint without a word as though there were no warp."""
+    path = tmp_path / f"{found}.ckpt"
+    torch.save({"state_dict": references[found].state}, path)
+    with pytest.raises(SystemExit) as stopped:
+        command(asked, path, "task=view", "inputs=3", "pose=frame000003")
+    message = str(stopped.value)
+    assert "\n" not in message
+    assert f"error: {path}: is of the family {found}" in message
+    assert f"model={asked} is of {asked} and was never trained: give model={found}" in message
+    assert ("model.start=FILE" in message) == (found == "zeronvs")
+    with pytest.raises(InputError, match=f"is of the family {found}"):
+        open_generator(str(path), config=tiny_config(asked))
+
+
+@pytest.mark.parametrize("asked", ["ours", "megascenes"])
+def test_another_family_is_still_what_training_starts_from(
+    references: dict[str, Reference], tmp_path: Path, asked: str
+) -> None:
+    path = tmp_path / "zeronvs.ckpt"
+    torch.save({"state_dict": references["zeronvs"].state}, path)
+    weight = initial_model(tiny_config(asked, start=str(path))).unet.conv_in.weight
+    assert weight[:, :8].any()
+    assert not weight[:, 8:].any()
