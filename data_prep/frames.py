@@ -71,7 +71,8 @@ def make_frames(
     """
     finer = max(1, (depth_source.image_size or 0) // image_size)
     where = f"sequence {sequence.category}/{sequence.name}"
-    views = _usable_views(sequence, where, image_size * finer)
+    brought = depth_source.image_size is None
+    views = _usable_views(sequence, where, image_size * finer, depth=brought)
     if all(view.mask is not None and not view.mask.any() for view in views):
         raise InputError(f"{where}: the masks are all black; remove them or the sequence")
     depths = torch.zeros(len(views), image_size, image_size)
@@ -101,11 +102,11 @@ def _remedy(source: DepthSource) -> str:
     return "are its photographs blank, or its poses wrong? Mend or remove it"
 
 
-def _usable_views(sequence: Sequence, where: str, size: int) -> list[View]:
+def _usable_views(sequence: Sequence, where: str, size: int, *, depth: bool) -> list[View]:
     views, reasons = [], []
     for frame in sequence.frames:
         try:
-            views.append(replace(object_square(frame.load(), size), name=frame.name))
+            views.append(replace(object_square(frame.load(depth=depth), size), name=frame.name))
         except InputError as error:
             reasons.append(str(error))
     if len(reasons) > MOST_UNUSABLE_SHARE * len(sequence.frames):

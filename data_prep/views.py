@@ -60,8 +60,8 @@ def input_views(
 
 def target_views(frames: ListOf[Frame], size: int) -> list[View]:
     """Frames framed in the same way, without depth: what a generated view is compared with."""
-    loaded = [replace(frame.load(), name=frame.name) for frame in frames]
-    return [replace(object_square(view, size), depth=None) for view in loaded]
+    loaded = [replace(frame.load(depth=False), name=frame.name) for frame in frames]
+    return [object_square(view, size) for view in loaded]
 
 
 def _unit(pixels: UInt8[np.ndarray, "..."]) -> Float[Tensor, "..."]:

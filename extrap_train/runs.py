@@ -13,7 +13,7 @@ import torch
 import yaml
 
 from extrap_train.config import SceneOptions, SyntheticConfig, TrainConfig, dotted
-from extrap_train.data.files import partial_beside, write_whole
+from extrap_train.data.files import partial_beside, remove_partial, write_whole
 from extrap_train.errors import InputError
 from extrap_train.trained_on import TRAINED_ON, TrainedOn
 
@@ -80,6 +80,21 @@ class RunFolder:
         """The result; a run that has it for the wanted number of steps is finished."""
         return self.path / "summary.json"
 
+    @property
+    def options(self) -> Path:
+        """What the run was started with."""
+        return self.path / "config.yaml"
+
+    @property
+    def lock(self) -> Path:
+        """Held by the process that trains the run; beside the folder, which may be removed."""
+        return self.path.with_name(f".{self.path.name}.lock")
+
+    @property
+    def has_learnt(self) -> bool:
+        """Whether there is something that other options or data would not have led to."""
+        return self.summary.is_file() or self.model.exists() or any(self.checkpoints.glob("*.ckpt"))
+
 
 def run_identity(config: TrainConfig) -> dict[str, Any]:
     """The options that make a run what it is, by dotted key.
@@ -112,19 +127,21 @@ def run_folder(config: TrainConfig) -> RunFolder:
     return RunFolder(_runs_of(config) / name)
 
 
-def open_run(config: TrainConfig) -> RunFolder:
-    """Make or find the run's folder and write its configuration; for one process alone.
+def open_run(config: TrainConfig, trained_on: TrainedOn) -> RunFolder:
+    """Make or find the run's folder, with its configuration and data; for one process alone.
 
-    With `resume=false` what an earlier run of that name left is removed first. Raises InputError
-    where a run of that name was started with other options and is to be resumed.
+    What an earlier run of that name left is removed with `resume=false`, or where it has learnt
+    nothing. Raises InputError, and changes nothing, where it was started with other options or data
+    and is to be resumed.
     """
     folder = run_folder(config)
-    saved = folder.path / "config.yaml"
-    if saved.is_file() and config.resume:
-        _check_same(saved, run_identity(config), config)
-    if not config.resume:
+    if config.resume and folder.has_learnt:
+        require_same_options(folder, config)
+        trained_on.require_same(folder.data)
+    else:
         _start_over(folder)
-    write_whole(saved, yaml.safe_dump(_said(config), sort_keys=False).encode())
+        trained_on.write(folder.data)
+    write_whole(folder.options, yaml.safe_dump(_said(config), sort_keys=False).encode())
     return folder
 
 
@@ -135,14 +152,6 @@ def existing_run(config: TrainConfig) -> RunFolder:
     if not folder.summary.is_file():
         raise InputError(f"{folder.path}: holds no finished run; train one (task=category)")
     return folder
-
-
-def note_data(folder: RunFolder, trained_on: TrainedOn) -> None:
-    """Keep what a run is trained on before its first step; InputError where that was another."""
-    if folder.summary.is_file() or any(folder.checkpoints.glob("*.ckpt")):
-        trained_on.require_same(folder.data)
-    else:
-        trained_on.write(folder.data)
 
 
 def newest_run(config: TrainConfig) -> RunFolder:
@@ -163,25 +172,32 @@ def _runs_of(config: TrainConfig) -> Path:
 
 
 def _start_over(folder: RunFolder) -> None:
-    """Remove what would make a later command resume the old run, or take it for finished."""
-    folder.summary.unlink(missing_ok=True)
-    folder.data.unlink(missing_ok=True)
-    shutil.rmtree(folder.checkpoints, ignore_errors=True)
-    shutil.rmtree(folder.averages, ignore_errors=True)
-    (folder.path / "metrics.csv").unlink(missing_ok=True)
+    """Remove the run at once: killed meanwhile, nothing of it is taken for the new one's."""
+    remove_partial(folder.path.parent)
+    if folder.path.exists():
+        removed = partial_beside(folder.path)
+        folder.path.rename(removed)
+        shutil.rmtree(removed)
 
 
-def _check_same(saved: Path, identity: dict[str, Any], config: TrainConfig) -> None:
-    """Options that the run's version did not have yet had their default."""
+def require_same_options(folder: RunFolder, config: TrainConfig) -> None:
+    """InputError where the run is to be resumed and has learnt with other options.
+
+    Options that the run's version did not have yet had their default.
+    """
+    saved = folder.options
+    if not (config.resume and folder.has_learnt and saved.is_file()):
+        return
     try:
         before = dotted(yaml.safe_load(saved.read_text()))
     except (yaml.YAMLError, UnicodeDecodeError, AttributeError) as error:
+        reason = " ".join(str(error).split())
         raise InputError(
-            f"{saved}: unreadable ({error}); remove the run or choose run=NAME"
+            f"{saved}: unreadable ({reason}); remove the run or choose run=NAME"
         ) from None
     changed = [
         f"{key} (was {was}, now {value})"
-        for key, value in identity.items()
+        for key, value in run_identity(config).items()
         if (was := before.get(key, _default(config, key))) != value
     ]
     if changed:

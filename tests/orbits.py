@@ -72,15 +72,23 @@ def capture(
     """A capture whose frame `i` is all of the grey `i / n`, at one depth."""
     count = len(camera.world_to_cam)
 
-    def load(index: int) -> View:
+    def load(index: int, depth_too: bool) -> View:
         if index in broken:
             raise InputError(f"{name}/frame{index}.jpg: truncated; restore it")
         size = (camera.height, camera.width)
         grey, flat = torch.full((3, *size), index / count), torch.full(size, depth)
-        return View(grey, camera[index], flat, mask(index), f"frame{index}")
+        far = flat if depth_too else None
+        return View(grey, camera[index], far, mask(index), f"frame{index}")
 
     frames = tuple(
-        Frame(f"frame{i}", camera[i], True, mask(i) is not None, lambda i=i: load(i), ())
+        Frame(
+            f"frame{i}",
+            camera[i],
+            True,
+            mask(i) is not None,
+            lambda *, depth=True, i=i: load(i, depth),
+            (),
+        )
         for i in range(count)
     )
     return Sequence("cup", name, frames, **quality)
@@ -95,7 +103,7 @@ class _Textured:
     depth_factor: float
     broken: bool
 
-    def load(self) -> View:
+    def load(self, *, depth: bool = True) -> View:
         if self.broken:
             raise InputError(f"{self.name}.jpg: truncated; restore it")
         exact = SPHERE_ON_PLANE.depth(self.camera)
@@ -103,8 +111,8 @@ class _Textured:
         waves = 9 * torch.randn(3, 40, generator=torch.Generator().manual_seed(5))
         fine = torch.sin(world @ waves + torch.arange(40.0)).unflatten(-1, (4, 10)).mean(-1)
         image = SPHERE_ON_PLANE.image(self.camera) + 0.8 * fine[..., :3].permute(2, 0, 1)
-        depth = exact * self.depth_factor
-        return View(image.clamp(0, 1), self.camera, depth.clamp(max=50), None, self.name)
+        far = (exact * self.depth_factor).clamp(max=50) if depth else None
+        return View(image.clamp(0, 1), self.camera, far, None, self.name)
 
 
 def textured_capture(

@@ -25,7 +25,7 @@ def _error(arguments: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     message = str(stopped.value)
     assert message.startswith("error: ")
     assert "\n" not in message
-    assert not list(tmp_path.glob("out/train/**/summary.json"))
+    assert not (tmp_path / "out" / "train").exists()
     return message
 
 
@@ -88,6 +88,32 @@ def test_a_missing_root_is_named_and_hydra_adds_no_line(
     options = ["category=hydrant", "data=co3d", f"data.root={tmp_path / 'nowhere'}"]
     assert "nowhere" in _error([*options, "model.start=null"], monkeypatch, tmp_path)
     assert "Error executing job" not in capfd.readouterr().err
+
+
+def test_a_run_is_not_begun_on_data_that_are_none(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Else its name would be taken."""
+    (tmp_path / "co3d").mkdir()
+    options = ["category=hydrant", "data=co3d", f"data.root={tmp_path / 'co3d'}", "run=mine"]
+    assert "has no category" in _error([*options, "model.start=null"], monkeypatch, tmp_path)
+
+
+def test_a_run_is_not_removed_before_there_is_another(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "co3d").mkdir()
+    run = tmp_path / "out/train/hydrant/small/mine"
+    for name in ("summary.json", "checkpoints/step-00000003.ckpt", "model/unet"):
+        (run / name).parent.mkdir(parents=True, exist_ok=True)
+        (run / name).touch()
+    before = sorted(run.rglob("*"))
+    options = ["data=co3d", f"data.root={tmp_path / 'co3d'}", "run=mine", "model.start=null"]
+    words = ["extrap_train", "category=hydrant", "resume=false", *options]
+    monkeypatch.setattr(sys, "argv", [*words, f"output={tmp_path / 'out'}"])
+    with pytest.raises(SystemExit, match="has no category"):
+        main()
+    assert sorted(run.rglob("*")) == before
 
 
 def test_a_full_disk_anywhere_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

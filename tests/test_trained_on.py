@@ -9,7 +9,7 @@ from prepared import prepared_captures
 
 from extrap_train.data.sequences import Sequence
 from extrap_train.errors import InputError
-from extrap_train.runs import RunFolder, note_data
+from extrap_train.runs import RunFolder
 from extrap_train.trained_on import TrainedOn
 
 
@@ -32,11 +32,10 @@ def sequences(tmp_path: Path) -> list[Sequence]:
 
 @pytest.fixture
 def begun(tmp_path: Path, sequences: list[Sequence]) -> RunFolder:
-    """A run with a checkpoint."""
+    """A run that says what it is trained on."""
     run = RunFolder(tmp_path / "run")
-    run.checkpoints.mkdir(parents=True)
-    note_data(run, trained_on(tmp_path / "cup", sequences, {"0000"}))
-    (run.checkpoints / "step-00000003.ckpt").touch()
+    run.path.mkdir()
+    trained_on(tmp_path / "cup", sequences, {"0000"}).write(run.data)
     return run
 
 
@@ -49,7 +48,7 @@ def test_the_same_data_go_on_wherever_they_lie(
     begun: RunFolder, sequences: list[Sequence], tmp_path: Path
 ) -> None:
     (tmp_path / "0002.jpg").touch()  # a copy has times of its own
-    note_data(begun, trained_on(tmp_path / "moved" / "cup", sequences, {"0000"}))
+    trained_on(tmp_path / "moved" / "cup", sequences, {"0000"}).require_same(begun.data)
 
 
 def test_changed_photographs_are_refused(
@@ -58,7 +57,7 @@ def test_changed_photographs_are_refused(
     (tmp_path / "0002.jpg").write_bytes(b"another photograph")
     again = trained_on(tmp_path / "cup", sequences, {"0000"})
     with pytest.raises(InputError, match=r"changed.*: cup \(other photographs.*resume=false"):
-        note_data(begun, again)
+        again.require_same(begun.data)
 
 
 def test_a_split_made_anew_is_refused(
@@ -67,28 +66,14 @@ def test_a_split_made_anew_is_refused(
     """Else what is tested on would be what was trained on."""
     again = trained_on(tmp_path / "cup", sequences, {"0001"})
     with pytest.raises(InputError, match=r"cup \(another split, 2 .* changed sides: 0000\)"):
-        note_data(begun, again)
+        again.require_same(begun.data)
 
 
-def test_before_the_first_checkpoint_nothing_is_lost(
-    begun: RunFolder, sequences: list[Sequence], tmp_path: Path
-) -> None:
-    (begun.checkpoints / "step-00000003.ckpt").unlink()
-    again = trained_on(tmp_path / "cup", sequences, {"0001"})
-    note_data(begun, again)
-    assert TrainedOn.read(begun.data) == again
-
-
-@pytest.mark.parametrize("mark", ["checkpoints/step-00000003.ckpt", "summary.json"])
-def test_a_run_from_before_there_was_such_a_file_says_so(
-    begun: RunFolder, sequences: list[Sequence], tmp_path: Path, mark: str
-) -> None:
+def test_a_run_from_before_there_was_such_a_file_says_so(begun: RunFolder) -> None:
     again = TrainedOn.read(begun.data)
     begun.data.unlink()
-    (begun.checkpoints / "step-00000003.ckpt").unlink()
-    (begun.path / mark).touch()
     with pytest.raises(InputError, match=r"begun before runs noted .* run=NAME, or resume=false"):
-        note_data(begun, again)
+        again.require_same(begun.data)
 
 
 @pytest.mark.parametrize("content", [b"[]", b"{", b'{"cup": {}}', b'{"cup": 3}', b'{"cup": []}'])
@@ -96,4 +81,4 @@ def test_a_damaged_record_is_one_line(begun: RunFolder, content: bytes) -> None:
     again = TrainedOn.read(begun.data)
     begun.data.write_bytes(content)
     with pytest.raises(InputError, match=r"data\.json"):
-        note_data(begun, again)
+        again.require_same(begun.data)

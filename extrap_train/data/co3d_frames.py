@@ -45,13 +45,13 @@ class _Photograph:
         depth = (self.depth.path, self.depth.mask_path) if self.depth else ()
         return tuple(self.root / p for p in (self.image_path, self.mask_path, *depth) if p)
 
-    def load(self) -> View:
+    def load(self, *, depth: bool = True) -> View:
         size = self.camera.height, self.camera.width
         mask_path = self.mask_path and resolve_inside(self.root, self.mask_path)
         return View(
             image=read_image(resolve_inside(self.root, self.image_path), size),
             camera=self.camera,
-            depth=_read_depth(self.root, self.depth, size) if self.depth else None,
+            depth=_read_depth(self.root, self.depth, size) if depth and self.depth else None,
             mask=read_mask(mask_path, size) if mask_path else None,
             name=self.name,
         )

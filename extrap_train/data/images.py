@@ -1,5 +1,6 @@
 """Photographs, masks and depth maps on disk to tensors, each checked against its annotated size."""
 
+import math
 import struct
 import warnings
 from pathlib import Path
@@ -55,12 +56,23 @@ def read_sixteen_bit(path: Path, size: tuple[int, int]) -> Shaped[np.ndarray, "h
 
 
 def known_depth(raw: Shaped[np.ndarray, "h w"], scale: float, path: Path) -> Float[Tensor, "h w"]:
-    """`raw` × `scale`, 0 where that is not positive and finite; an empty map is an error."""
+    """`raw` × `scale`, 0 where that is not positive and finite.
+
+    An empty map, and a scale that is no positive number, is an error that names `path`.
+    """
+    if not (math.isfinite(scale) and scale > 0):
+        raise InputError(
+            f"{path}: the scale of its depth is {scale}, no positive number; correct its entry or "
+            "estimate depth (depth=stereo)"
+        )
     with np.errstate(invalid="ignore", over="ignore"):
         depth = raw.astype(np.float32) * np.float32(scale)
     depth[~(np.isfinite(depth) & (depth > 0))] = 0
     if not depth.any():
-        raise InputError(f"{path}: the depth map is zero everywhere; remove it or its frame")
+        raise InputError(
+            f"{path}: the depth map is zero everywhere; remove it or its frame, or estimate depth "
+            "(depth=stereo)"
+        )
     return torch.from_numpy(depth)
 
 

@@ -55,16 +55,16 @@ class _Loader:
         paths = (photo.image_path, photo.mask_path, photo.depth_path)
         return tuple(self.root / path for path in paths if path)
 
-    def load(self) -> View:
+    def load(self, *, depth: bool = True) -> View:
         photo, size = self.photograph, (self.camera.height, self.camera.width)
         image = read_image(resolve_inside(self.root, photo.image_path), size)
-        depth = _read_depth(self.root, photo) if photo.depth_path else None
+        far = _read_depth(self.root, photo) if depth and photo.depth_path else None
         mask_path = photo.mask_path and resolve_inside(self.root, photo.mask_path)
         mask = read_mask(mask_path, size) if mask_path else None
         return View(
             image=self._straight(image.permute(1, 2, 0)).permute(2, 0, 1).contiguous(),
             camera=self.camera,
-            depth=None if depth is None else self._straight(depth, nearest=True),
+            depth=None if far is None else self._straight(far, nearest=True),
             mask=None if mask is None else self._straight(mask),
             name=self.name,
         )

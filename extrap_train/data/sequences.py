@@ -1,12 +1,23 @@
 """Captures on disk: a sequence of posed frames, read lazily, whatever the format they came in."""
 
-from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 from extrap_train.data.files import resolve_inside
 from extrap_train.views import Camera, View
+
+
+@runtime_checkable
+class Load(Protocol):
+    """Reads a photograph."""
+
+    def __call__(self, *, depth: bool = True) -> View:
+        """Image and mask at full resolution, and what depth the data set has unless not wanted:
+        then its file is not opened. Raises InputError that names the file.
+        """
+        ...
 
 
 @dataclass(frozen=True)
@@ -19,8 +30,7 @@ class Frame:
     """At the resolution of the image on disk."""
     has_depth: bool
     has_mask: bool
-    load: Callable[[], View]
-    """Reads image, depth and mask at full resolution; raises InputError that names the file."""
+    load: Load
     files: tuple[Path, ...]
     """What `load` reads; none where it renders."""
 

@@ -16,6 +16,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from rich.console import Console
 
 from extrap_train.config import TrainConfig
+from extrap_train.data.module import PairModule
 from extrap_train.data.store import PreparedData
 from extrap_train.diffusion.averages import PowerAverages
 from extrap_train.diffusion.callbacks import (
@@ -31,46 +32,65 @@ from extrap_train.diffusion.memory import advice_where_memory_ends, training_mem
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.errors import InputError
-from extrap_train.metrics import Distance, lpips_or_reason
+from extrap_train.metrics import lpips_or_reason
 from extrap_train.processes import Opening, announce, is_first, join
-from extrap_train.runs import RunFolder, note_data, open_run, point_latest, provenance, run_folder
+from extrap_train.runs import (
+    RunFolder,
+    open_run,
+    point_latest,
+    provenance,
+    require_same_options,
+    run_folder,
+)
 from extrap_train.tasks.results import Results, draw_curve, draw_views, is_finished, write_results
 from extrap_train.tasks.training_data import data_module, prepared_data, validation_names
 from extrap_train.trained_on import TrainedOn
 
 
 def run(config: TrainConfig) -> Path:
-    """Train a category model and leave weights, metrics, pictures and `summary.json` behind."""
+    """Train a category model and leave weights, metrics, pictures and `summary.json` behind.
+
+    Nothing of a run is begun or removed before its options, its start and its data are known to be
+    good.
+    """
     console = Console(quiet=not is_first())
     quieten_lightning()
     distance, missing = lpips_or_reason(config.validation.lpips_weights)
+    folder = run_folder(config)
+    require_same_options(folder, config)  # before what takes minutes
     model = _model(config)
     if (needed := training_memory(model, config.trainer)).is_worth_a_word:
         console.print(f"{needed}")
-    folder = run_folder(config)
-    with _opened(folder, config) as opening:
+    started = time.perf_counter()
+    prepared = prepared_data(config)
+    data = data_module(config, prepared)
+    seconds = {"prepare": time.perf_counter() - started}
+    with _opened(folder, config, TrainedOn.of(config.category.members, prepared)) as opening:
         if opening.is_finished:
             console.print(f"already trained for {config.trainer.steps} steps: {folder.path}")
-        else:
-            _train(config, folder, opening.checkpoint, model, distance, missing, console)
+            return folder.path
+        training = CategoryTraining(model, config, validation_names(data), distance)
+        _train(training, data, opening.checkpoint, folder, seconds)
+        if is_first():
+            save_model(training.model, folder.model)
+            draw_curve(folder)
+            results = _results(training, prepared, missing, seconds)
+            write_results(results, config, folder, console)
     return folder.path
 
 
 @contextmanager
-def _opened(folder: RunFolder, config: TrainConfig) -> Iterator[Opening]:
+def _opened(folder: RunFolder, config: TrainConfig, trained_on: TrainedOn) -> Iterator[Opening]:
     """The run, closed to other commands; the first process opens it, the others follow."""
     if not is_first():
         yield join(folder.path)
         return
     try:
-        with FileLock(folder.path / ".lock", timeout=0):
-            open_run(config)
-            is_over = config.resume and is_finished(folder, config)
-            if is_over:
-                _prepared(config, folder)
-                point_latest(folder)
+        with FileLock(folder.lock, timeout=0):
+            open_run(config, trained_on)
+            point_latest(folder)
             newest = checkpoints(folder.checkpoints)[-1:]
-            opening = Opening(is_over, str(newest[0]) if newest else None)
+            opening = Opening(is_finished(folder, config), str(newest[0]) if newest else None)
             announce(folder.path, opening)
             yield opening
     except Timeout:
@@ -80,51 +100,40 @@ def _opened(folder: RunFolder, config: TrainConfig) -> Iterator[Opening]:
 
 
 def _train(
-    config: TrainConfig,
-    folder: RunFolder,
+    training: CategoryTraining,
+    data: PairModule,
     checkpoint: str | None,
-    model: ExtrapolationModel,
-    distance: Distance | None,
-    missing: dict[str, str],
-    console: Console,
+    folder: RunFolder,
+    seconds: dict[str, float],
 ) -> None:
+    """Train and validate, and note how long both took."""
     started = time.perf_counter()
-    prepared = _prepared(config, folder)
-    if is_first():
-        point_latest(folder)
-    seconds = {"prepare": time.perf_counter() - started}
-    data = data_module(config, prepared)
-    training = CategoryTraining(model, config, validation_names(data), distance)
-    started = time.perf_counter()
-    trainer = _trainer(config, folder, checkpoint)
-    with advice_where_memory_ends(config.trainer), _ended_together(trainer):
+    trainer = _trainer(training.config, folder, checkpoint)
+    with advice_where_memory_ends(training.config.trainer), _ended_together(trainer):
         trainer.fit(training, data, ckpt_path=checkpoint, weights_only=True)
     seconds["train"] = time.perf_counter() - started
     if training.validated_step != trainer.global_step:
         trainer.validate(training, data, verbose=False)
     seconds["validate"] = training.validation_seconds
-    if not trainer.is_global_zero:
-        return
-    save_model(training.model, folder.model)
-    results = Results(
+
+
+def _results(
+    training: CategoryTraining,
+    prepared: list[PreparedData],
+    missing: dict[str, str],
+    seconds: dict[str, float],
+) -> Results:
+    return Results(
         scores=training.scores(),
         shown=training.pictures(),
         missing=missing,
         seconds=seconds,
-        steps=trainer.global_step,
+        steps=training.validated_step,
         parameters=sum(p.numel() for p in training.model.parameters()),
-        provenance=provenance(config, {d.folder.name: d.manifest["key"] for d in prepared}),
+        provenance=provenance(
+            training.config, {d.folder.name: d.manifest["key"] for d in prepared}
+        ),
     )
-    draw_curve(folder)
-    write_results(results, config, folder, console)
-
-
-def _prepared(config: TrainConfig, folder: RunFolder) -> list[PreparedData]:
-    """The member categories; InputError where the run was begun with others."""
-    prepared = prepared_data(config)
-    if is_first():
-        note_data(folder, TrainedOn.of(config.category.members, prepared))
-    return prepared
 
 
 def quieten_lightning() -> None:

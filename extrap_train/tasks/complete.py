@@ -179,11 +179,11 @@ def _started_map(job: _Job, workshop: Workshop, console: Console) -> GlobalMap:
     if len(known) >= len(job.inputs):
         console.print(f"{folder}: {len(known)} views are there already")
         return known
-    photographs = [job.sequence.frames[i].load() for i in job.inputs]
+    source = depth_source(job.config.depth)
+    brought = source.image_size is None
+    photographs = [job.sequence.frames[i].load(depth=brought) for i in job.inputs]
     check_poses(photographs)
-    views, confidences = first_views(
-        photographs, depth_source(job.config.depth), job.unit, workshop.generator.warp_size
-    )
+    views, confidences = first_views(photographs, source, job.unit, workshop.generator.warp_size)
     known = map_of_inputs(views, confidences, job.config.complete.tolerance)
     for index, view in enumerate(known.views):
         save_view(view, folder, index)

@@ -154,7 +154,7 @@ def _compare_held_out(
     if not frames or config.complete.generator == "exact":
         return None, {}
     size = workshop.generator.image_size
-    truth = [frame.load().squared(size) for frame in frames]
+    truth = [frame.load(depth=False).squared(size) for frame in frames]
     cameras = [done.unit.inside(view.camera) for view in truth]
     made, warps, masks = [], [], []
     only = GlobalMap(done.known.tolerance, given)

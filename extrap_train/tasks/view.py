@@ -129,8 +129,8 @@ def _queries(
             f"pose={config.pose}: is neither a frame of the scene nor a .json file; its frames are "
             f"{', '.join(list(known)[:4])}, …"
         )
-    square = object_square(known[config.pose].load(), size)
-    truth = replace(square, depth=None, name=config.pose)
+    square = object_square(known[config.pose].load(depth=False), size)
+    truth = replace(square, name=config.pose)
     return [config.pose], stack_cameras([truth.camera]), truth
 
 

@@ -61,5 +61,5 @@ def analytic_capture(count: int = 12, size: int = 32, name: str = "one") -> Sequ
 class _Photograph:
     view: View
 
-    def __call__(self) -> View:
-        return self.view
+    def __call__(self, *, depth: bool = True) -> View:
+        return self.view if depth else replace(self.view, depth=None)

@@ -220,6 +220,27 @@ def test_depth_that_is_zero_everywhere(root):
     file = root / frame_entries(root)[0]["depth"]["path"]
     Image.fromarray(np.zeros((32, 40), np.uint16)).save(file)
     assert "depth map is zero everywhere" in complaint(load_first, root)
+    assert "depth=stereo" in complaint(load_first, root)
+
+
+@pytest.mark.parametrize("scale", [float("nan"), float("inf"), 0.0, -1.0])
+def test_a_scale_of_depth_that_is_no_positive_number(root, scale):
+    entry = frame_entries(root)[0]
+    entry["depth"]["scale_adjustment"] = scale
+    replace_frame_entries(root, [entry])
+    message = complaint(load_first, root)
+    assert f"geometric.png: the scale of its depth is {scale}, no positive number" in message
+    assert "depth=stereo" in message
+
+
+def test_depth_that_is_not_asked_for_is_not_read(root):
+    frame = read_category(root, "cup")[0].frames[0]
+    whole = frame.load()
+    (root / frame_entries(root)[0]["depth"]["path"]).write_bytes(b"no picture")
+    without = frame.load(depth=False)
+    assert without.depth is None
+    np.testing.assert_array_equal(without.image, whole.image)
+    np.testing.assert_array_equal(without.mask, whole.mask)
 
 
 def test_mask_that_is_black_everywhere(root):

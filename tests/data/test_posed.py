@@ -156,6 +156,16 @@ def test_lens_distortion_is_undone(folder):
     assert SCENE.depth(original.camera).unique().numel() >= view.depth.unique().numel()
 
 
+def test_depth_that_is_not_asked_for_is_not_read(folder):
+    frame = read_transforms(folder).frames[0]
+    whole = frame.load()
+    (folder / "depth_001.png").write_bytes(b"no picture")
+    without = frame.load(depth=False)
+    assert without.depth is None
+    assert torch.equal(without.image, whole.image)
+    assert torch.equal(without.mask, whole.mask)
+
+
 def test_the_scale_of_the_world_is_the_scale_of_its_depth(folder):
     write_json(folder, read_json(folder) | {"applied_scale": 0.5})
     depth = read_transforms(folder).frames[0].load().depth

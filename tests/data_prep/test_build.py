@@ -84,7 +84,7 @@ def test_other_pair_options_keep_the_frames_other_sizes_do_not(tmp_path: Path) -
 def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
     depth = CountingDepth(calls=([],))
 
-    def interrupt() -> View:
+    def interrupt(*, depth: bool) -> View:
         raise KeyboardInterrupt
 
     sequences = captures(3)
@@ -181,7 +181,7 @@ def test_held_out_photographs_lend_no_depth(tmp_path: Path) -> None:
 def test_a_frame_without_depth_is_no_reference(tmp_path: Path) -> None:
     sequences = captures(2)
     frame = sequences[0].frames[6]
-    empty = replace(frame, load=lambda: replace(frame.load(), depth=torch.zeros(48, 64)))
+    empty = replace(frame, load=lambda depth: replace(frame.load(), depth=torch.zeros(48, 64)))
     frames = (*sequences[0].frames[:6], empty, *sequences[0].frames[7:])
     data = run(tmp_path / "cup", [replace(sequences[0], frames=frames), sequences[1]])
     pairs = [p for s in ("train", "test") for p in data.pairs(s) if p.sequence == "cup/0000"]

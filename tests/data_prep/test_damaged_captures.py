@@ -14,7 +14,14 @@ from captures import frame_entries, replace_frame_entries, write_capture
 from orbits import capture, even, ring
 
 from data_prep.frames import make_frames
-from extrap_train.config import Co3dConfig, DatasetDepthConfig, FlowMatcherConfig, PrepConfig
+from extrap_train.config import (
+    Co3dConfig,
+    DatasetDepthConfig,
+    DepthConfig,
+    FlowMatcherConfig,
+    PrepConfig,
+    StereoConfig,
+)
 from extrap_train.data.store import PreparedData
 from extrap_train.depth import DepthMap
 from extrap_train.depth.dataset import DatasetDepth
@@ -47,11 +54,11 @@ def photographs(tmp_path: Path) -> Path:
     return tmp_path / "co3d"
 
 
-def prepared(photographs: Path) -> PreparedData:
+def prepared(photographs: Path, depth: DepthConfig | None = None) -> PreparedData:
     return prepare_category(
         "cup",
         Co3dConfig(root=str(photographs), test_sequences=1),
-        DatasetDepthConfig(),
+        depth or DatasetDepthConfig(),
         PrepConfig(image_size=16, correct=False),
         output=photographs.parent / "outputs",
         workers=1,
@@ -90,6 +97,14 @@ def test_damaged_sequences_are_reported_and_the_rest_goes_on(
     assert corrupt.name not in data.names("cup/one_corrupt")
     assert len(data.names("cup/one_corrupt")) == FRAMES - 1
     assert f"1 frames left out: {corrupt}" in caplog.text
+
+
+def test_estimated_depth_needs_none_of_the_data_sets(photographs: Path) -> None:
+    for file in (photographs / "cup").glob("*/depths/*.png"):
+        file.write_bytes(b"no picture")
+    data = prepared(photographs, StereoConfig(image_size=32, planes=8))
+    assert data.manifest["sequences"] == {"kept": len(NAMES), "dropped": 0, "failed": 0}
+    assert data.frames("cup/fine", [0])[1].any()
 
 
 def test_a_restored_sequence_is_taken_in_and_nothing_else_redone(photographs: Path) -> None:

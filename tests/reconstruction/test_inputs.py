@@ -143,7 +143,7 @@ def test_no_depth_at_all_is_refused():
 
 def frames(count: int) -> list[Frame]:
     cams = ring(even(count))
-    return [Frame(f"f{i}", cams[i], True, False, lambda: None, ()) for i in range(count)]
+    return [Frame(f"f{i}", cams[i], True, False, lambda depth: None, ()) for i in range(count)]
 
 
 def test_one_sided_inputs_are_neighbours_and_spread_ones_are_not():

@@ -17,8 +17,9 @@ class _Renderer:
     camera: Camera
     name: str
 
-    def load(self) -> View:
-        return replace(render(self.scene, self.camera), name=self.name)
+    def load(self, *, depth: bool = True) -> View:
+        view = replace(render(self.scene, self.camera), name=self.name)
+        return view if depth else replace(view, depth=None)
 
 
 def synthetic_sequence(category: str, index: int, options: SyntheticConfig) -> Sequence:
