@@ -1,6 +1,7 @@
 """The training loop's mathematics and its optimiser, as a LightningModule."""
 
 import time
+import zlib
 from typing import Any
 
 import lightning
@@ -52,9 +53,7 @@ class CategoryTraining(lightning.LightningModule):
 
     def training_step(self, batch: PairBatch, batch_idx: int) -> Tensor:
         """One step; its noise is a function of seed, step and rank."""
-        generator = torch.Generator().manual_seed(
-            (self.config.seed * 2**20 + self.global_step) * 64 + self.global_rank
-        )
+        generator = step_generator(self.config.seed, self.global_step, self.global_rank)
         options = self.config.trainer
         loss = diffusion_loss(
             self.model, batch, generator, options.condition_dropout, options.min_snr
@@ -129,6 +128,18 @@ class CategoryTraining(lightning.LightningModule):
         )
         rate = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: rate_at(step, trainer))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": rate, "interval": "step"}}
+
+
+def step_generator(seed: int, step: int, rank: int) -> torch.Generator:
+    """The generator of one process's noise at one step.
+
+    torch's CPU generator takes 32 bits of a seed: where there are more (from seed 64 on), all of
+    them are hashed into 32, so that no two steps of a run are the same.
+    """
+    number = (seed * 2**20 + step) * 64 + rank
+    if number >= 2**32:
+        number = zlib.crc32(number.to_bytes(12, "little"))
+    return torch.Generator().manual_seed(number)
 
 
 def rate_at(step: int, options: TrainerConfig) -> float:

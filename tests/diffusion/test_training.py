@@ -6,7 +6,7 @@ import torch
 from extrap_train.config import ModelConfig, TrainerConfig
 from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.model import ExtrapolationModel
-from extrap_train.diffusion.training import rate_at
+from extrap_train.diffusion.training import rate_at, step_generator
 from extrap_train.views import PairBatch
 
 
@@ -23,6 +23,26 @@ def test_the_loss_depends_on_the_seed_and_on_nothing_else(
     torch.rand(10)  # the global generator must not matter
     assert torch.equal(first, diffusion_loss(model, batch, _generator(1), 0.1))
     assert not torch.equal(first, diffusion_loss(model, batch, _generator(2), 0.1))
+
+
+def test_no_two_seeds_steps_or_processes_draw_the_same() -> None:
+    """Seeds that lie 64 apart among them: torch reads 32 bits of a number."""
+    seeds = (0, 1, 63, 64, 65, 127, 128, 64 * 64, 2**30)
+    drawn = {
+        float(torch.rand((), generator=step_generator(seed, step, rank), dtype=torch.float64))
+        for seed in seeds
+        for step in (0, 1, 59_999)
+        for rank in (0, 1, 63)
+    }
+    assert len(drawn) == 9 * len(seeds)
+
+
+@pytest.mark.parametrize(("seed", "step", "rank"), [(0, 0, 0), (3, 1199, 0), (63, 2**20 - 1, 63)])
+def test_a_seed_below_64_draws_what_it_always_did(seed: int, step: int, rank: int) -> None:
+    """The packaged weights were trained with these numbers."""
+    before = torch.Generator().manual_seed((seed * 2**20 + step) * 64 + rank)
+    now = step_generator(seed, step, rank)
+    assert torch.equal(torch.rand(4, generator=now), torch.rand(4, generator=before))
 
 
 def test_every_weight_receives_a_gradient(config: ModelConfig, batch: PairBatch) -> None:
