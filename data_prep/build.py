@@ -4,7 +4,6 @@ import hashlib
 import json
 import logging
 import shutil
-from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from collections.abc import Sequence as ListOf
 from dataclasses import asdict, dataclass, replace
@@ -17,6 +16,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 from data_prep.correct import METHOD as CORRECTION_METHOD
 from data_prep.filter import judge_all
 from data_prep.frames import METHOD, CaptureKeys
+from data_prep.reasons import kinds_of
 from data_prep.split import Split, split_sequences
 from data_prep.tables import Outcome, write_results
 from data_prep.tools import Tools, put_away
@@ -209,11 +209,16 @@ def _left_out(outcome: Outcome, reason: str | Died) -> Outcome:
 def _nothing_left(outcomes: list[Outcome]) -> str:
     if not outcomes:
         return "no sequence to prepare; check the category and the data set's root"
-    reasons = Counter(o.verdict.reason.removeprefix(f"sequence {o.name}: ") for o in outcomes)
-    listed = "; ".join(f"{count} times {reason}" for reason, count in reasons.most_common(3))
+    kinds = kinds_of(o.verdict.reason.removeprefix(f"sequence {o.name}: ") for o in outcomes)
+    listed = "; ".join(kind.counted for kind in kinds[:3])
+    remedies = ["add sequences"]
+    if not all(outcome.failed for outcome in outcomes):
+        remedies.insert(0, "loosen prep.* (prep.full_circle=ignore keeps partial turns)")
+    if any(outcome.failed for outcome in outcomes):
+        remedies.insert(0, "mend what is named")
     return (
         f"none of the {len(outcomes)} sequences of {outcomes[0].sequence.category} can be used: "
-        f"{listed}. Loosen prep.* (prep.full_circle=ignore keeps partial turns) or add sequences"
+        f"{listed}. To go on, {' or '.join(remedies)}"
     )
 
 

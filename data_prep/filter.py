@@ -99,7 +99,7 @@ def _quality_reasons(sequence: Sequence, options: PrepConfig) -> list[str]:
     return [
         f"{name} quality {score:.2f} < {least:g}"
         for name, score, least in scores
-        if score is not None and not score >= least
+        if score is not None and score < least  # NaN says nothing, as None does
     ]
 
 

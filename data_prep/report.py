@@ -1,6 +1,5 @@
 """What was prepared, to look at: printed, and saved as a page with pictures."""
 
-from collections import Counter
 from importlib.resources import files
 from pathlib import Path
 
@@ -11,12 +10,12 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
+from data_prep.reasons import kinds_of
 from data_prep.report_pairs import (
     as_png,
     correction_report,
     pair_sheet,
     share_corrected,
-    without_numbers,
 )
 from data_prep.split import held_out
 from extrap_train.data.files import write_whole
@@ -68,11 +67,10 @@ def _categories(data: PreparedData) -> list[str]:
 
 
 def _reasons(dropped: pd.DataFrame) -> list[tuple[str, int]]:
-    """What sequences were left out for, numbers and names taken off, the most frequent first."""
+    """What sequences were left out for, the most frequent first."""
     rows = zip(dropped["sequence"], dropped["reason"], strict=True)
     plain = (reason.removeprefix(f"sequence {name}: ") for name, reason in rows)
-    kinds = Counter(without_numbers(reason) for reason in plain)
-    return kinds.most_common(_REASONS)
+    return [(kind.short, kind.count) for kind in kinds_of(plain)[:_REASONS]]
 
 
 def summary(data: PreparedData) -> dict[str, str]:

@@ -1,8 +1,6 @@
 """The report's pictures of pairs, and what correction did for them."""
 
 import io
-import re
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +8,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
+from data_prep.reasons import kinds_of
 from extrap_train.data.files import write_whole
 from extrap_train.data.store import UNTOUCHED, Pairs, PreparedData
 from extrap_train.geometry.warp import warp_references
@@ -49,15 +48,9 @@ def correction_facts(data: PreparedData) -> dict[str, str]:
         facts["photometric error taken away"] = (
             f"median {middle:.1%}, 5 % and 95 % quantiles {low:.1%} and {high:.1%}"
         )
-    reasons = Counter(without_numbers(reason) for reason in pairs.uncorrected[~moved])
-    for reason, count in reasons.most_common(6):
-        facts[f"left alone: {count}"] = reason
+    for kind in kinds_of(pairs.uncorrected[~moved])[:6]:
+        facts[f"left alone: {kind.count}"] = kind.short
     return facts
-
-
-def without_numbers(reason: str) -> str:
-    """What reasons that differ in their numbers only have in common."""
-    return re.sub(r"[0-9]+([.,][0-9]+)*", "#", reason)
 
 
 def error_histogram(pairs: Pairs) -> Figure:

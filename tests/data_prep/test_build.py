@@ -151,6 +151,23 @@ def test_nothing_left_sums_up_the_reasons(tmp_path: Path) -> None:
         run(tmp_path / "cup", [])
 
 
+def test_nothing_left_of_damaged_files_says_so_once_and_advises_to_mend_them(
+    tmp_path: Path,
+) -> None:
+    damaged = [capture(ring(even(24)), f"/s{i}", broken=range(24)) for i in range(3)]
+    with pytest.raises(InputError) as caught:
+        run(tmp_path / "cup", damaged)
+    assert str(caught.value) == (
+        "none of the 3 sequences of cup can be used: 3 times, for instance 24 of 24 frames cannot "
+        "be used, the first because of /s0/frame0.jpg: truncated; restore it. To go on, mend what "
+        "is named or add sequences"
+    )
+    arc = capture(ring(even(24, 90)), "arc")
+    options = replace(OPTIONS, full_circle="require")
+    with pytest.raises(InputError, match=r"To go on, mend what is named or loosen prep\.\*"):
+        run(tmp_path / "cup", [*damaged, arc], options=options)
+
+
 def test_a_nan_camera_drops_its_sequence(tmp_path: Path) -> None:
     camera = ring(even(24))
     camera.world_to_cam[3] = float("nan")

@@ -73,8 +73,10 @@ def test_overhead_views_do_not_fill_a_gap() -> None:
 def test_stated_qualities_count_and_missing_ones_do_not() -> None:
     camera = ring(even(24))
     assert judge(capture(camera, viewpoint_quality=0.5, point_cloud_quality=1.0), OPTIONS).kept
-    poor = judge(capture(camera, viewpoint_quality=-0.5, point_cloud_quality=float("nan")), OPTIONS)
-    assert poor.reason == "viewpoint quality -0.50 < 0; point cloud quality nan < -2"
+    poor = judge(capture(camera, viewpoint_quality=-0.5, point_cloud_quality=-3.0), OPTIONS)
+    assert poor.reason == "viewpoint quality -0.50 < 0; point cloud quality -3.00 < -2"
+    unstated = capture(camera, viewpoint_quality=float("nan"), point_cloud_quality=float("nan"))
+    assert judge(unstated, OPTIONS).kept
 
 
 def test_a_nan_camera_is_named() -> None:

@@ -39,6 +39,18 @@ def test_the_page_says_what_was_kept_and_why_not(data: PreparedData) -> None:
     assert "covers #°" in printed
 
 
+def test_a_file_that_is_named_can_be_found(tmp_path: Path) -> None:
+    sequences = [capture(ring(even(24)), str(i)) for i in range(3)]
+    sequences += [capture(ring(even(24)), "/eyes2_run/s7", broken=(4, 5, 6))]
+    options, folder = PrepConfig(image_size=16), tmp_path / "cup"
+    data = prepare(sequences, DatasetDepth(), options, test_names=1, folder=folder, progress=False)
+    console = Console(record=True, width=300, quiet=False, file=None)
+    page = write_report(data, console).read_text()
+    reason = "3 of 24 frames cannot be used, the first because of /eyes2_run/s7/frame4.jpg: trunc"
+    assert reason in page
+    assert reason in console.export_text()
+
+
 def test_the_table_of_pairs_is_read_once_for_all_pictures(
     data: PreparedData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
