@@ -98,8 +98,8 @@ def command(name: str, run: Callable[[Any], Path | None]) -> None:
         sys.exit(f"error: {error}")
     except (HydraException, OmegaConfBaseException) as error:
         sys.exit(f"error: {_one_line(error, _overrides(sys.argv[1:]))}")
-    except KeyboardInterrupt:
-        sys.exit("interrupted: run the same command again to resume")
+    except KeyboardInterrupt as stopped:
+        sys.exit(f"interrupted: {str(stopped) or 'run the same command again to resume'}")
 
 
 def _remedy(error: OSError, output: str) -> str | None:

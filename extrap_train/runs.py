@@ -123,7 +123,7 @@ def _digest(identity: dict[str, Any]) -> str:
 
 def run_folder(config: TrainConfig) -> RunFolder:
     """Where the run lies or will lie; raises InputError where no folder may be called so."""
-    name = _given_name(config) or f"seed{config.seed}-{_digest(run_identity(config))[:8]}"
+    name = given_name(config) or f"seed{config.seed}-{_digest(run_identity(config))[:8]}"
     return RunFolder(_runs_of(config) / name)
 
 
@@ -147,7 +147,7 @@ def open_run(config: TrainConfig, trained_on: TrainedOn) -> RunFolder:
 
 def existing_run(config: TrainConfig) -> RunFolder:
     """The finished run that `run` names, by default the newest; InputError where there is none."""
-    name = _given_name(config)
+    name = given_name(config)
     folder = RunFolder(_runs_of(config) / name) if name else newest_run(config)
     if not folder.summary.is_file():
         raise InputError(f"{folder.path}: holds no finished run; train one (task=category)")
@@ -159,7 +159,7 @@ def newest_run(config: TrainConfig) -> RunFolder:
     return RunFolder(_runs_of(config) / _LATEST)
 
 
-def _given_name(config: TrainConfig) -> str | None:
+def given_name(config: TrainConfig) -> str | None:
     """`run`, if that can be a folder among the runs and is not the link to the newest."""
     name = config.run
     if name and (name in (".", "..", _LATEST) or {"/", "\\", "\0"} & set(name)):

@@ -50,6 +50,7 @@ from extrap_train.reconstruction.pose_check import check_poses
 from extrap_train.reconstruction.viewer import CloudViewer
 from extrap_train.runs import newest_run
 from extrap_train.tasks.completed import Completed, write_completed
+from extrap_train.tasks.scene_folder import require_same, result_folder
 from extrap_train.tasks.scene_inputs import required_scene, trained_model
 from extrap_train.views import stack_cameras, stack_poses
 
@@ -107,7 +108,7 @@ def _job(config: TrainConfig) -> _Job:
     cameras = [sequence.frames[i].camera for i in inputs]
     check_cameras(cameras, [sequence.frames[i].name for i in inputs])
     _check_category(config, sequence)
-    folder = Path(config.output) / "complete" / (config.run or _slug(sequence))
+    folder = result_folder(config, _slug(sequence))
     return _Job(config, sequence, truth, folder, inputs, world_unit(stack_poses(cameras)))
 
 
@@ -174,7 +175,7 @@ def _started_map(job: _Job, workshop: Workshop, console: Console) -> GlobalMap:
     folder = job.folder / "map"
     if not job.config.resume:
         shutil.rmtree(folder, ignore_errors=True)
-    _check_same(folder / "options.json", _identity(job, workshop))
+    _note_options(folder / "options.json", _identity(job, workshop))
     known = load_map(folder, job.config.complete.tolerance)
     if len(known) >= len(job.inputs):
         console.print(f"{folder}: {len(known)} views are there already")
@@ -215,17 +216,11 @@ def _identity(job: _Job, workshop: Workshop) -> dict[str, Any]:
     }
 
 
-def _check_same(saved: Path, identity: dict[str, Any]) -> None:
-    if saved.is_file():
-        before = json.loads(saved.read_text())
-        changed = [key for key, value in identity.items() if before.get(key) != value]
-        if changed:
-            raise InputError(
-                f"{saved.parent}: was made with another {', '.join(changed)}; choose run=NAME, or "
-                "resume=false to start over"
-            )
+def _note_options(record: Path, options: dict[str, Any]) -> None:
+    if record.is_file():
+        require_same(record, options, "start over")
     else:
-        write_whole(saved, (json.dumps(identity, indent=1) + "\n").encode())
+        write_whole(record, (json.dumps(options, indent=1) + "\n").encode())
 
 
 def _queries(job: _Job, known: GlobalMap) -> list[Query]:

@@ -14,10 +14,11 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from data_prep.views import target_views
-from extrap_train.config import SamplerConfig, TrainConfig, sampler_for
+from extrap_train.config import SamplerConfig, TrainConfig, dotted, sampler_for
 from extrap_train.data.files import write_whole
 from extrap_train.data.module import spread
 from extrap_train.data.scene_pairs import AdaptationPairs, adaptation_pairs
+from extrap_train.data.sequences import Sequence
 from extrap_train.diffusion.adaptation import Adaptation, adapt
 from extrap_train.diffusion.evaluation import score_images, summarise
 from extrap_train.diffusion.generator import DiffusionGenerator, GeneratedViews
@@ -27,7 +28,15 @@ from extrap_train.errors import InputError
 from extrap_train.metrics import Distance, lpips_or_reason
 from extrap_train.pictures import contact_sheet, curve, error_map, mark_holes
 from extrap_train.tasks.results import without_nan
-from extrap_train.tasks.scene_inputs import SceneInputs, fabric_of, open_inputs, trained_model
+from extrap_train.tasks.scene_folder import claimed, result_folder, scene_options, whole_result
+from extrap_train.tasks.scene_inputs import (
+    SceneInputs,
+    fabric_of,
+    label_of,
+    open_inputs,
+    open_sequence,
+    trained_model,
+)
 from extrap_train.views import View, stack_cameras
 
 
@@ -35,25 +44,35 @@ def run(config: TrainConfig) -> Path:
     """Train an adapter for `minutes` and leave it with its numbers and pictures behind.
 
     What the input views leave over of the scene is held out: the model is measured there with and
-    without the adapter.
+    without the adapter. Adapter and numbers appear together, or, interrupted, not at all.
     """
     console = Console()
     if config.adapter is not None:
         raise InputError("task=scene makes an adapter and takes none: leave adapter= out")
+    sequence = open_sequence(config)
+    folder, options = result_folder(config, label_of(sequence)), _options(config)
+    with claimed(folder, options, resume=config.resume):
+        _run(config, sequence, folder, options, console)
+    console.print(f"result: {folder}")
+    return folder
+
+
+def _run(
+    config: TrainConfig, sequence: Sequence, folder: Path, options: dict[str, Any], console: Console
+) -> None:
     distance, missing = lpips_or_reason(config.validation.lpips_weights)
     fabric = fabric_of(config)
     model = trained_model(config).to(fabric.device)
-    inputs = open_inputs(config, model.config.warp_size)
+    inputs = open_inputs(config, sequence, model.config.warp_size)
     pairs = adaptation_pairs(
         inputs.views, model.config.told_references, config.lora.virtual_references, config.seed
     )
-    folder = Path(config.output) / "scene" / inputs.label
     sampler = sampler_for(config.sampler, model.config)
     targets = _targets(config, inputs, model)
     asked = _asked(config, model, inputs.views, targets, sampler)
     if config.resume and _is_done(folder, asked):
-        console.print(f"already adapted with these options: {folder}")
-        return folder
+        console.print("already adapted with these options")
+        return
     before = _generate(model, config, inputs, targets, fabric)
     adapter = add_adapter(model, config.lora, config.seed)
     with _bar() as bar:
@@ -73,13 +92,23 @@ def run(config: TrainConfig) -> Path:
             fabric=fabric,
             on_step=on_step,
         )
-    save_adapter(adapter, folder / "adapter")
     after = _generate(model, config, inputs, targets, fabric)
-    measured = _measure(before, after, targets, folder, distance)
-    _write(folder, asked, done, pairs, measured, missing)
+    with whole_result(folder, options) as whole:
+        save_adapter(adapter, whole / "adapter")
+        measured = _measure(before, after, targets, whole, distance)
+        _write(whole, asked, done, pairs, measured, missing)
     console.print(_said(done, measured))
-    console.print(f"result: {folder}")
-    return folder
+
+
+def _options(config: TrainConfig) -> dict[str, Any]:
+    """Of an adapter and its numbers."""
+    adapting = {
+        "lora": asdict(config.lora),
+        "minutes": config.minutes,
+        "validation.examples": config.validation.examples,
+        "validation.lpips_weights": config.validation.lpips_weights,
+    }
+    return scene_options(config) | dotted(adapting)
 
 
 def _asked(

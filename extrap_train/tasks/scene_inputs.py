@@ -26,18 +26,9 @@ from extrap_train.views import View
 class SceneInputs:
     """A scene's chosen views with depth, and its frames that are left over."""
 
-    sequence: Sequence
     views: list[View]
     """Square, at the size that a model's warps are made at."""
     others: list[Frame]
-
-    @property
-    def label(self) -> str:
-        """The scene's name in a path."""
-        sequence = self.sequence
-        if sequence.category == CATEGORY:
-            return sequence.name
-        return f"{sequence.category}-{sequence.name}"
 
 
 def required_scene(config: TrainConfig) -> str:
@@ -50,24 +41,48 @@ def required_scene(config: TrainConfig) -> str:
     return config.scene
 
 
-def open_inputs(config: TrainConfig, image_size: int, query: str | None = None) -> SceneInputs:
+def open_sequence(config: TrainConfig) -> Sequence:
+    """The scene's frames, of which no photograph has been read yet."""
+    synthetic = config.data if isinstance(config.data, SyntheticConfig) else None
+    return open_scene(required_scene(config), synthetic)
+
+
+def label_of(sequence: Sequence) -> str:
+    """The scene's name in a path."""
+    if sequence.category == CATEGORY:
+        return sequence.name
+    return f"{sequence.category}-{sequence.name}"
+
+
+def input_frames(
+    config: TrainConfig, sequence: Sequence, query: str | None = None
+) -> tuple[Sequence, list[int]]:
+    """The frames that inputs are chosen from, and the places of those that are; see `open_inputs`.
+
+    Reads no photograph. Raises InputError where there are too few.
+    """
+    known = tuple(frame for frame in sequence.frames if frame.name != query)
+    part = sequence if config.input_frames else replace(sequence, frames=known)
+    if not part.frames:
+        raise InputError(
+            f"scene {config.scene}: {query} is its only frame, and is asked for; give more"
+        )
+    return part, choose_frames(part, config.input_frames, config.inputs)
+
+
+def open_inputs(
+    config: TrainConfig, sequence: Sequence, image_size: int, query: str | None = None
+) -> SceneInputs:
     """The scene's input views at this size; depth comes from these views alone.
 
     The frame called `query` is none of them, so that it can be compared with, unless
     `input_frames` names it.
     """
-    scene = required_scene(config)
-    synthetic = config.data if isinstance(config.data, SyntheticConfig) else None
-    sequence = open_scene(scene, synthetic)
-    known = [frame for frame in sequence.frames if frame.name != query]
-    part = sequence if config.input_frames else replace(sequence, frames=tuple(known))
-    if not part.frames:
-        raise InputError(f"scene {scene}: {query} is its only frame, and is asked for; give more")
-    chosen = choose_frames(part, config.input_frames, config.inputs)
+    part, chosen = input_frames(config, sequence, query)
     views = input_views(part, chosen, depth_source(config.depth), image_size)
     names = {view.name for view in views}
     others = [frame for frame in sequence.frames if frame.name not in names]
-    return SceneInputs(sequence, views, others)
+    return SceneInputs(views, others)
 
 
 def trained_model(config: TrainConfig) -> ExtrapolationModel:
@@ -77,12 +92,21 @@ def trained_model(config: TrainConfig) -> ExtrapolationModel:
     """
     if config.weights is not None:
         return open_model(config.weights, config.adapter, config.model)
-    newest = newest_run(config).model
-    if newest.is_dir():
-        return open_model(str(newest), config.adapter)
-    name = _packaged(config)
-    Console(stderr=True).print(f"{newest}: there is none yet; weights={name}, of the package")
+    name, newest = named_weights(config), newest_run(config).model
+    if not newest.is_dir():
+        Console(stderr=True).print(f"{newest}: there is none yet; weights={name}, of the package")
     return open_model(name, config.adapter)
+
+
+def named_weights(config: TrainConfig) -> str:
+    """What `weights` names, or what takes its place: an absolute path, or a packaged model's name.
+
+    Raises InputError where nothing does.
+    """
+    path = newest_run(config).model if config.weights is None else Path(config.weights)
+    if path.exists():
+        return str(path.resolve())
+    return config.weights or _packaged(config)
 
 
 def _packaged(config: TrainConfig) -> str:

@@ -4,8 +4,8 @@ The same in Python: `open_generator`, `open_views`, `walk`.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -21,44 +21,61 @@ from extrap_train.config import (
     TrainConfig,
     sampler_for,
 )
-from extrap_train.data.files import whole_folder
 from extrap_train.data.posed import read_cameras
 from extrap_train.data.scene import open_scene
+from extrap_train.data.sequences import Sequence
 from extrap_train.depth.build import depth_source
 from extrap_train.diffusion.generator import DiffusionGenerator, GeneratedViews
-from extrap_train.errors import InputError
+from extrap_train.errors import InputError, did_you_mean
 from extrap_train.geometry.orbits import LEAST_VIEWS, orbit_cameras
 from extrap_train.metrics import psnr, quantised
 from extrap_train.pictures import contact_sheet, film, mark_holes, picture, picture_names
+from extrap_train.tasks.scene_folder import claimed, result_folder, scene_options, whole_result
 from extrap_train.tasks.scene_inputs import (
     SceneInputs,
     fabric_of,
+    input_frames,
+    label_of,
     open_inputs,
     open_model,
-    required_scene,
+    open_sequence,
     trained_model,
 )
 from extrap_train.views import Camera, View, stack_cameras
 
 
+@dataclass(frozen=True)
+class _Query:
+    """What is asked for, as far as it is known before any depth is."""
+
+    names: list[str]
+    cameras: Camera | None
+    """None on an orbit, which follows from the inputs."""
+    photograph: View | None
+    """Of a frame that is asked for, as it was taken."""
+
+
 def run(config: TrainConfig) -> None:
-    """Paint the views that `pose` or `orbit` ask for, and leave them as PNG, GIF and MP4."""
+    """Paint the views that `pose` or `orbit` ask for, and leave them as PNG, GIF and MP4.
+
+    They take the place of what was asked of the same scene, inputs and weights before.
+    """
     console = Console()
-    required_scene(config)
-    if (config.pose is None) == (config.orbit is None):
-        raise InputError("task=view needs a pose=FRAME|FILE.json or an orbit=DEGREES, one of both")
-    fabric = fabric_of(config)
-    model = trained_model(config).to(fabric.device)
-    inputs = open_inputs(config, model.config.warp_size, config.pose)
-    names, cameras, truth = _queries(config, inputs, model.config.image_size)
-    with fabric.autocast():
-        generator = DiffusionGenerator(model, sampler_for(config.sampler, model.config))
-        made = generator.generate(inputs.views, cameras, names, config.seed)
-    folder = Path(config.output) / "view" / inputs.label
-    with whole_folder(folder, lambda _: False) as whole:  # nothing of another pose's stays in it
-        _write(made, inputs.views, names, whole, walk=config.orbit is not None)
-        if truth is not None:
-            picture(truth.image, whole / "truth.png")
+    sequence = open_sequence(config)
+    query = _query(config, sequence)
+    folder, options = result_folder(config, label_of(sequence)), scene_options(config)
+    with claimed(folder, options, resume=config.resume):
+        fabric = fabric_of(config)
+        model = trained_model(config).to(fabric.device)
+        inputs = open_inputs(config, sequence, model.config.warp_size, config.pose)
+        cameras, truth = _cameras(query, inputs.views, config, model.config.image_size)
+        with fabric.autocast():
+            generator = DiffusionGenerator(model, sampler_for(config.sampler, model.config))
+            made = generator.generate(inputs.views, cameras, query.names, config.seed)
+        with whole_result(folder, options) as whole:  # nothing of another pose's stays in it
+            _write(made, inputs.views, query.names, whole, walk=config.orbit is not None)
+            if truth is not None:
+                picture(truth.image, whole / "truth.png")
     if truth is not None:
         console.print(_compared(made, truth, inputs))
     console.print(f"result: {folder}")
@@ -100,38 +117,55 @@ def open_views(
     return input_views(sequence, chosen, source, generator.warp_size)
 
 
-def walk(views: Sequence[View], degrees: float, frames: int) -> tuple[Camera, list[str]]:
+def walk(views: ListOf[View], degrees: float, frames: int) -> tuple[Camera, list[str]]:
     """Cameras around what the views look at, from the first view's azimuth on, and their names."""
-    if len(views) < LEAST_VIEWS:
-        raise InputError(
-            f"an orbit needs {LEAST_VIEWS} input views to say which way it leans, not "
-            f"{len(views)}; give more, or a pose="
-        )
+    _require_orbit(len(views))
     cameras = stack_cameras([view.camera for view in views])
-    around = orbit_cameras(cameras, math.radians(degrees), frames)
-    return around, [f"{index:03d}" for index in range(frames)]
+    return orbit_cameras(cameras, math.radians(degrees), frames), _places(frames)
 
 
-def _queries(
-    config: TrainConfig, inputs: SceneInputs, size: int
-) -> tuple[list[str], Camera, View | None]:
-    """Names and cameras of the queries, and the photograph where there is one."""
-    if config.orbit is not None:
-        cameras, names = walk(inputs.views, config.orbit, config.frames)
-        return names, cameras, None
-    assert config.pose is not None
+def _require_orbit(views: int) -> None:
+    if views < LEAST_VIEWS:
+        raise InputError(
+            f"an orbit needs {LEAST_VIEWS} input views to say which way it leans, not {views}; "
+            "give more, or a pose="
+        )
+
+
+def _places(frames: int) -> list[str]:
+    return [f"{index:03d}" for index in range(frames)]
+
+
+def _query(config: TrainConfig, sequence: Sequence) -> _Query:
+    """InputError where nothing can be painted of what is asked for."""
+    if (config.pose is None) == (config.orbit is None):
+        raise InputError("task=view needs a pose=FRAME|FILE.json or an orbit=DEGREES, one of both")
+    if config.pose is None:
+        _require_orbit(len(input_frames(config, sequence)[1]))
+        return _Query(_places(config.frames), None, None)
     if Path(config.pose).suffix == ".json":
-        names, cameras = read_cameras(Path(config.pose))
-        return names, cameras, None
-    known = {frame.name: frame for frame in inputs.sequence.frames}
+        return _Query(*read_cameras(Path(config.pose)), None)
+    known = {frame.name: frame for frame in sequence.frames}
     if config.pose not in known:
         raise InputError(
-            f"pose={config.pose}: is neither a frame of the scene nor a .json file; its frames are "
-            f"{', '.join(list(known)[:4])}, …"
+            f"pose={config.pose}: is neither a frame of the scene nor a .json file; "
+            f"{did_you_mean(config.pose, known)}"
         )
-    square = object_square(known[config.pose].load(depth=False), size)
-    truth = replace(square, name=config.pose)
-    return [config.pose], stack_cameras([truth.camera]), truth
+    return _Query([config.pose], None, known[config.pose].load(depth=False))
+
+
+def _cameras(
+    query: _Query, views: list[View], config: TrainConfig, size: int
+) -> tuple[Camera, View | None]:
+    """The cameras to paint, and the photograph at the pictures' size where there is one."""
+    if query.photograph is not None:
+        square = object_square(query.photograph, size)
+        truth = replace(square, name=query.names[0])
+        return stack_cameras([truth.camera]), truth
+    if query.cameras is not None:
+        return query.cameras, None
+    assert config.orbit is not None
+    return walk(views, config.orbit, config.frames)[0], None
 
 
 def _write(
