@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from extrap_train.data.files import write_whole
@@ -12,7 +12,7 @@ from extrap_train.data.validation import require_dict
 from extrap_train.errors import InputError
 
 TRAINED_ON = "data.json"
-"""In a run's folder."""
+"""In a run's folder, beside its model; beside the packaged models likewise."""
 START_OVER = "choose another run=NAME, or resume=false to start over"
 """What to do with a run that cannot go on."""
 
@@ -31,6 +31,10 @@ class CategoryData:
     """Sequences whose frames are trained on, but for those held out; no category."""
     test: tuple[str, ...]
     """Sequences that are for testing alone."""
+    seed: int | None = field(default=None, compare=False)
+    """Of rendered captures, whose names say nothing without it (it is part of the key); None of
+    others, and where a record is older than this entry.
+    """
 
     @classmethod
     def of(cls, prepared: PreparedData) -> "CategoryData":
@@ -44,13 +48,26 @@ class CategoryData:
             for tested in (False, True)
         }
         manifest = prepared.manifest
+        data = manifest["data"] or {}
         return cls(
-            source=(manifest["data"] or {}).get("name", ""),
+            source=data.get("name", ""),
             key=manifest["key"],
             split=manifest["split"],
             train=tuple(names[False]),
             test=tuple(names[True]),
+            seed=data.get("seed"),
         )
+
+    def seen_by(self, other: "CategoryData") -> list[str]:
+        """Which of what is for testing here was trained on there, the category being the same.
+
+        Rendered captures of two seeds are others, whatever they are called; where one is not noted,
+        they count as the same.
+        """
+        differ = None not in (self.seed, other.seed) and self.seed != other.seed
+        if differ or self.source != other.source:
+            return []
+        return sorted({*self.test} & {*other.train})
 
 
 @dataclass(frozen=True)

@@ -138,7 +138,7 @@ def _save(tensors: dict[str, Tensor], path: Path, about: Mapping[str, str] | Non
 
 def load_model(folder: Path, option: str = "weights") -> ExtrapolationModel:
     """The model of a folder written by `save_model` that `option` named, in float32; strict."""
-    config = _saved_config(folder)
+    config = saved_config(folder)
     with torch.device("meta"):
         model = ExtrapolationModel(config)
     load_weights(model, folder, option)
@@ -150,8 +150,10 @@ def is_own(path: Path) -> bool:
     return (path / MODEL_CONFIG).is_file()
 
 
-def _saved_config(folder: Path) -> ModelConfig:
-    """Of the types and within the bounds that the command line's options have, too."""
+def saved_config(folder: Path) -> ModelConfig:
+    """What the model of a folder is: of the types and within the bounds that the command line's
+    options have, too; InputError where the folder says not.
+    """
     file = folder / MODEL_CONFIG
     try:
         saved = json.loads(file.read_text())
@@ -198,7 +200,7 @@ def load_weights(
 
 def _family(path: Path, file: WeightFile, conv_in: Tensor) -> str:
     if is_own(path):
-        return _saved_config(path).family
+        return saved_config(path).family
     channels = conv_in.shape[1]
     if channels not in _PUBLISHED_CHANNELS:
         raise file.refusal(
@@ -213,7 +215,7 @@ def _lacks_geometry(path: Path, config: ModelConfig) -> bool:
     """
     if not (path / MODEL_CONFIG).is_file():
         return False
-    saved = _saved_config(path)
+    saved = saved_config(path)
     return not saved.geometry and saved.octaves == config.octaves
 
 

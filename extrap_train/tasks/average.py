@@ -7,6 +7,7 @@ from extrap_train.diffusion.averages import take_average
 from extrap_train.diffusion.checkpoint import load_model, save_model
 from extrap_train.runs import RunFolder, existing_run
 from extrap_train.tasks.measure import RunData, measure
+from extrap_train.trained_on import TrainedOn
 
 
 def run(config: TrainConfig) -> Path:
@@ -17,5 +18,6 @@ def run(config: TrainConfig) -> Path:
     step = take_average(model, trained.averages, config.average_width)
     folder = RunFolder(trained.averages / f"width-{config.average_width:g}")
     save_model(model, folder.model)
+    TrainedOn.read(trained.data).write(folder.data)
     measure(model, step, config, data, folder)
     return folder.path

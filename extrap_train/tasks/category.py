@@ -43,6 +43,7 @@ from extrap_train.runs import (
     run_folder,
 )
 from extrap_train.tasks.results import Results, draw_curve, draw_views, is_finished, write_results
+from extrap_train.tasks.seen_before import require_unseen
 from extrap_train.tasks.training_data import data_module, prepared_data, validation_names
 from extrap_train.trained_on import TrainedOn
 
@@ -65,7 +66,9 @@ def run(config: TrainConfig) -> Path:
     prepared = prepared_data(config)
     data = data_module(config, prepared)
     seconds = {"prepare": time.perf_counter() - started}
-    with _opened(folder, config, TrainedOn.of(config.category.members, prepared)) as opening:
+    trained_on = TrainedOn.of(config.category.members, prepared)
+    require_unseen(config.model.start, trained_on)
+    with _opened(folder, config, trained_on) as opening:
         if opening.is_finished:
             console.print(f"already trained for {config.trainer.steps} steps: {folder.path}")
             return folder.path

@@ -9,12 +9,14 @@ from rich.console import Console
 
 from extrap_train.config import TrainConfig
 from extrap_train.data.store import PreparedData
+from extrap_train.diffusion.checkpoint import saved_config
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.metrics import lpips_or_reason
 from extrap_train.runs import RunFolder, provenance
 from extrap_train.tasks.category import quieten_lightning
 from extrap_train.tasks.results import Results, write_results
+from extrap_train.tasks.seen_before import require_unseen
 from extrap_train.tasks.training_data import data_module, prepared_data, validation_names
 from extrap_train.trained_on import TrainedOn
 
@@ -34,6 +36,7 @@ class RunData:
         prepared = prepared_data(config)
         today = TrainedOn.of(config.category.members, prepared)
         today.require_same(trained.data, "measure another run=NAME, or train one anew")
+        require_unseen(saved_config(trained.model).start, today)
         return cls(prepared, time.perf_counter() - started)
 
 

@@ -1,0 +1,77 @@
+"""A model is never measured on what its start, or that one's start, was trained on."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from extrap_train.config import SyntheticConfig
+from extrap_train.diffusion.packaged import MODEL_CONFIG, packaged_names, packaged_weights
+from extrap_train.errors import InputError
+from extrap_train.tasks.seen_before import require_unseen
+from extrap_train.trained_on import CategoryData, TrainedOn
+
+
+def _split(test: int, seed: int | None = 0, category: str = "hydrant") -> TrainedOn:
+    """Of rendered captures, the first `test` of which are held out."""
+    names = tuple(f"{index:04d}" for index in range(12))
+    data = CategoryData("synthetic", "key", "split", names[test:], names[:test], seed)
+    return TrainedOn({category: data})
+
+
+def _model(run: Path, start: str | None, trained_on: TrainedOn | None) -> str:
+    """The model's folder of a run that began with `start`."""
+    folder = run / "model"
+    folder.mkdir(parents=True)
+    options = json.loads((packaged_weights("base") / MODEL_CONFIG).read_text())
+    (folder / MODEL_CONFIG).write_text(json.dumps(options | {"start": start}))
+    if trained_on is not None:
+        trained_on.write(run / "data.json")
+    return str(folder)
+
+
+@pytest.mark.parametrize("name", packaged_names())
+def test_every_packaged_model_says_what_it_has_seen(name: str) -> None:
+    require_unseen(name, _split(SyntheticConfig().test_sequences))
+    said = rf"start={name} was trained on 0005, 0006 of hydrant, .*data\.test_sequences=5 or fewer"
+    with pytest.raises(InputError, match=rf"{said}, another data\.seed, or model\.start=null"):
+        require_unseen(name, _split(7))
+
+
+@pytest.mark.parametrize(
+    "unseen",
+    [
+        _split(7, seed=1),
+        _split(7, category="vase"),
+        TrainedOn({"hydrant": replace(_split(7).categories["hydrant"], source="co3d")}),
+    ],
+)
+def test_what_is_only_called_alike_is_not_the_same(unseen: TrainedOn) -> None:
+    require_unseen("base", unseen)
+
+
+def test_random_weights_have_seen_nothing() -> None:
+    require_unseen(None, _split(7))
+
+
+def test_a_start_goes_back_to_its_own_start(tmp_path: Path) -> None:
+    """Its run, of other objects, says nothing of what the packaged base has seen."""
+    own = _model(tmp_path / "run", "base", _split(5, category="vase"))
+    require_unseen(own, _split(5))
+    with pytest.raises(InputError, match=r"0005, 0006 of hydrant, by way of base"):
+        require_unseen(own, _split(7))
+
+
+def test_a_run_counts_for_what_it_was_trained_on(tmp_path: Path) -> None:
+    own = _model(tmp_path / "run", None, _split(2, seed=3))
+    require_unseen(own, _split(2, seed=3))
+    with pytest.raises(InputError, match=r"0002, 0003, 0004 and 2 more .*test_sequences=2 or"):
+        require_unseen(own, _split(7, seed=3))
+    with pytest.raises(InputError, match="0002"):
+        require_unseen(own, _split(7, seed=None))
+
+
+def test_a_model_that_says_nothing_is_taken_at_that(tmp_path: Path) -> None:
+    require_unseen(_model(tmp_path / "run", None, None), _split(7))
+    require_unseen(str(tmp_path / "published.ckpt"), _split(7))
