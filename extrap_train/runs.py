@@ -12,7 +12,14 @@ from typing import Any
 import torch
 import yaml
 
-from extrap_train.config import SceneOptions, SyntheticConfig, TrainConfig, dotted
+from extrap_train.config import (
+    SceneOptions,
+    SyntheticConfig,
+    TrainConfig,
+    dotted,
+    placed,
+    placed_value,
+)
 from extrap_train.data.files import partial_beside, remove_partial, write_whole
 from extrap_train.errors import InputError
 from extrap_train.trained_on import TRAINED_ON, TrainedOn
@@ -26,18 +33,30 @@ _NOT_PART_OF_THE_RUN = (
     "trainer.steps",
     "trainer.gradient_checkpointing",
     "trainer.compile",
+    "trainer.accelerator",
+    "trainer.workers",
+    "trainer.checkpoint_every",
+    "trainer.validate_every",
     "complete",
     "average_width",
     "model.sampler",
     *(field.name for field in fields(SceneOptions)),
 )
-"""May differ on resume: where things lie, how they are measured, how long is trained, how the
-machine goes about the same mathematics, and what other tasks read. What the model recommends to
-sample with is part of the run as far as it is used, under `sampler`.
+"""May differ on resume: where things lie, how they are measured, how long is trained, how often
+that is saved, how the machine goes about the same mathematics, and what other tasks read. What the
+model recommends to sample with is part of the run as far as it is used, under `sampler`.
 """
 
 _ADDED = {"model.joint_views": 1, "data.set_list": None}
 """Options that came later, with the value that leaves all as it was: runs keep their names."""
+
+_FORMERLY = {
+    "trainer.accelerator": "auto",
+    "trainer.workers": 0,
+    "trainer.checkpoint_every": 200,
+    "trainer.validate_every": 400,
+}
+"""Options that once counted, with the value that most runs had: they keep their names."""
 
 _LATEST = "latest"
 """Link to the newest run of a model and category."""
@@ -112,13 +131,15 @@ def run_identity(config: TrainConfig) -> dict[str, Any]:
 
 
 def _said(config: TrainConfig) -> dict[str, Any]:
-    """All options, with the sampler as it is used: what the model recommends is spelled out."""
-    return asdict(config) | {"sampler": asdict(config.sampler.over(config.model.sampler))}
+    """All options, with the sampler as it is used: what the model recommends is spelled out; paths
+    as they lead from everywhere.
+    """
+    return asdict(placed(config)) | {"sampler": asdict(config.sampler.over(config.model.sampler))}
 
 
 def _digest(identity: dict[str, Any]) -> str:
     named = {k: v for k, v in identity.items() if k not in _ADDED or v != _ADDED[k]}
-    return hashlib.sha256(json.dumps(named, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(_FORMERLY | named, sort_keys=True).encode()).hexdigest()
 
 
 def run_folder(config: TrainConfig) -> RunFolder:
@@ -198,13 +219,19 @@ def require_same_options(folder: RunFolder, config: TrainConfig) -> None:
     changed = [
         f"{key} (was {was}, now {value})"
         for key, value in run_identity(config).items()
-        if (was := before.get(key, _default(config, key))) != value
+        if (was := _before(before, key, config)) != value
     ]
     if changed:
         raise InputError(
             f"{saved.parent}: started with other options: {', '.join(changed)}; "
             "give them back their values, or choose another run=NAME, or resume=false to start over"
         )
+
+
+def _before(options: dict[str, Any], key: str, config: TrainConfig) -> Any:
+    """An option's value among a saved run's, or its default where it is newer than the run."""
+    value = options[key] if key in options else _default(config, key)
+    return placed_value(key.rpartition(".")[2], value)
 
 
 def _default(config: Any, key: str) -> Any:

@@ -191,3 +191,23 @@ def test_a_longer_training_goes_on_where_the_shorter_ended(
     _finish(tmp_path, "trainer.steps=6")
     _finish(tmp_path)
     assert _weights(tmp_path) == _weights(undisturbed)
+
+
+def test_what_is_no_part_of_a_run_changes_nothing_that_is_learnt(
+    undisturbed: Path, tmp_path: Path
+) -> None:
+    """How often is saved and measured, and by which process batches are loaded, here changed on
+    the way; the snapshots of averages are as many as the checkpoints, the last one is the same.
+    """
+    for name in ("synthetic", "data"):
+        (tmp_path / name).symlink_to(undisturbed / name)
+    _finish(tmp_path, "trainer.steps=4", "trainer.checkpoint_every=2", "trainer.validate_every=4")
+    first = _run_folder(tmp_path)
+    changed = ["trainer.checkpoint_every=5", "trainer.validate_every=5", "trainer.workers=1"]
+    _finish(tmp_path, *changed, "trainer.accelerator=cpu")
+    assert _run_folder(tmp_path) == first
+    assert first.name == _run_folder(undisturbed).name
+    wanted, got = _weights(undisturbed), _weights(tmp_path)
+    shared = [name for name in wanted if not name.startswith("averages/") or "00000012" in name]
+    assert len(shared) > 1
+    assert {name: got[name] for name in shared} == {name: wanted[name] for name in shared}

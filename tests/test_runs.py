@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -163,6 +164,55 @@ def test_another_download_is_another_run(config: TrainConfig) -> None:
     assert opened(moved) == opened(config)
 
 
+def test_the_same_download_is_the_same_run_however_its_path_is_spelled(
+    config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "co3d").mkdir()
+    (tmp_path / "link").symlink_to("co3d")
+    monkeypatch.chdir(tmp_path)
+    spelled = ["co3d", "co3d/", "link", f"{tmp_path}/link/../co3d", str(tmp_path / "co3d")]
+    for name in (None, "mine"):
+        runs = {
+            begun(replace(config, run=name, data=Co3dConfig(root=root))).path for root in spelled
+        }
+        assert len(runs) == 1
+    saved = runs.pop() / "config.yaml"
+    assert yaml.safe_load(saved.read_text())["data"]["root"] == str(tmp_path / "co3d")
+    saved.write_text(saved.read_text().replace(str(tmp_path / "co3d"), "link/"))  # by an older one
+    opened(replace(config, run="mine", data=Co3dConfig(root="co3d")))
+
+
+def test_a_start_is_a_path_where_there_is_one(
+    config: TrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def start(value: str) -> RunFolder:
+        return opened(replace(config, model=replace(config.model, start=value)))
+
+    monkeypatch.chdir(tmp_path)
+    named = start("base")
+    (tmp_path / "base").mkdir()
+    assert start("base") == start("./base/") != named
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        {"workers": 2},
+        {"accelerator": "cpu"},
+        {"checkpoint_every": 40},
+        {"validate_every": 800},
+        {"steps": 9},
+    ],
+)
+def test_what_changes_nothing_learnt_is_the_same_run(
+    config: TrainConfig, option: dict[str, Any]
+) -> None:
+    changed = replace(config, trainer=replace(config.trainer, **option))
+    assert opened(changed) == opened(config)
+    begun(replace(config, run="mine"))
+    opened(replace(changed, run="mine"))
+
+
 @pytest.mark.parametrize("name", ["latest", "../other", "a/b", ".", "..", "a/", "a\\b", "/a"])
 def test_a_run_has_the_name_of_a_folder(config: TrainConfig, name: str) -> None:
     """Else `resume=false` would remove what lies beside or above all runs."""
@@ -193,7 +243,7 @@ def test_an_option_that_changes_nothing_renames_no_run(config: TrainConfig) -> N
 
 
 def test_a_download_without_a_set_list_has_the_run_it_had(config: TrainConfig) -> None:
-    download = Co3dConfig(root="co3d")
-    assert opened(replace(config, data=download)).path.name == "seed0-8e6e01a4"
+    download = Co3dConfig(root="/data/co3d")
+    assert opened(replace(config, data=download)).path.name == "seed0-cc32b794"
     divided = replace(download, set_list="fewview_dev")
     assert opened(replace(config, data=divided)) != opened(replace(config, data=download))

@@ -50,6 +50,7 @@ from extrap_train.config.model import (
     UNetConfig,
     VaeConfig,
 )
+from extrap_train.config.places import placed, placed_value
 from extrap_train.config.sampling import require_published, sampler_for
 from extrap_train.config.scene import LoraConfig, SceneOptions
 from extrap_train.config.training import TrainerConfig, ValidationConfig
@@ -102,6 +103,8 @@ __all__ = [
     "VaeConfig",
     "ValidationConfig",
     "dotted",
+    "placed",
+    "placed_value",
     "require_published",
     "required_file",
     "sampler_for",

@@ -15,7 +15,7 @@ from filelock import FileLock, Timeout
 from lightning.pytorch.loggers import TensorBoardLogger
 from rich.console import Console
 
-from extrap_train.config import TrainConfig
+from extrap_train.config import TrainConfig, placed
 from extrap_train.data.module import PairModule
 from extrap_train.data.store import PreparedData
 from extrap_train.diffusion.averages import PowerAverages
@@ -148,7 +148,7 @@ def quieten_lightning() -> None:
 
 def _model(config: TrainConfig) -> ExtrapolationModel:
     torch.manual_seed(config.seed)
-    model = initial_model(config.model)
+    model = initial_model(placed(config.model))  # which says for good what it started from
     for network in model.parts().values():
         network.to(memory_format=torch.channels_last)
     if config.trainer.gradient_checkpointing:

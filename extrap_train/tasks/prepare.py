@@ -6,9 +6,9 @@ import hashlib
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from filelock import FileLock, Timeout
 
@@ -24,9 +24,9 @@ from extrap_train.config import (
     LauncherConfig,
     LocalConfig,
     MatcherConfig,
-    MonocularConfig,
     PrepConfig,
     SyntheticConfig,
+    placed,
 )
 from extrap_train.data.co3d import read_category
 from extrap_train.data.sequences import Sequence
@@ -36,7 +36,6 @@ from extrap_train.jobs import Launcher
 from extrap_train.jobs.build import open_launcher
 
 LOCAL = LocalConfig()
-Options = TypeVar("Options", bound=DataConfig | DepthConfig | MatcherConfig)
 
 
 def prepare_category(
@@ -57,7 +56,7 @@ def prepare_category(
     sequences that failed before are tried again. Paths are followed to where they lead, so that
     other spellings of one are the same preparation.
     """
-    data, depth, matcher = _placed(data), _placed(depth), _placed(matcher)
+    data, depth, matcher = placed(data), placed(depth), placed(matcher)
     how = matcher if is_corrected(data, depth, prep) else None
     tools = Tools(depth, how)
     tools.check()  # before anything is rendered
@@ -127,19 +126,6 @@ def _sequences(
         return sequences, data.test_sequences
     split = read_sequence_split(root, category, data.set_list)
     return [s for s in sequences if s.name in split.train | split.test], set(split.test)
-
-
-def _placed(options: Options) -> Options:
-    """The same options with paths that lead to where theirs do, whatever they went through."""
-    placed: dict[str, Any] = {}
-    for name in ("root", "checkpoint"):
-        if path := getattr(options, name, None):
-            placed[name] = str(Path(path).resolve())
-    if isinstance(options, MonocularConfig):
-        if Path(options.model).is_dir():  # otherwise it is a name in the cache of downloads
-            placed["model"] = str(Path(options.model).resolve())
-        placed["matcher"] = _placed(options.matcher)
-    return replace(options, **placed)
 
 
 def _said(data: DataConfig) -> dict[str, Any]:

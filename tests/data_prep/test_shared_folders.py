@@ -16,11 +16,12 @@ from extrap_train.config import (
     MonocularConfig,
     PrepConfig,
     SyntheticConfig,
+    placed,
 )
 from extrap_train.data.frame_files import frames_folder, pairs_folder
 from extrap_train.data.sequences import Sequence
 from extrap_train.data.store import PreparedData
-from extrap_train.tasks.prepare import _placed, prepare_category
+from extrap_train.tasks.prepare import prepare_category
 
 OPTIONS = PrepConfig(image_size=16)
 HELD_OUT = [4, 9, 14, 19]
@@ -129,10 +130,10 @@ def test_weights_are_the_same_however_their_path_is_spelt(
         )
         for folder in (Path(), tmp_path)
     )
-    assert _placed(spelt) == whole == _placed(whole)
+    assert placed(spelt) == whole == placed(whole)
     named = MonocularConfig(matcher=FlowMatcherConfig())
-    assert _placed(named) == named
-    assert _placed(SyntheticConfig()) == SyntheticConfig()
+    assert placed(named) == named
+    assert placed(SyntheticConfig()) == SyntheticConfig()
 
 
 def test_a_changed_option_redoes_only_what_depends_on_it(tmp_path: Path) -> None:
