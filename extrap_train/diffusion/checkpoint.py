@@ -15,12 +15,13 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from extrap_train.config import ModelConfig, validate_model
+from extrap_train.config import ModelConfig, dotted, validate_model
 from extrap_train.data.files import partial_beside, write_whole
 from extrap_train.diffusion.autoencoder import PixelPatches
 from extrap_train.diffusion.compact import compress, restore
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.packaged import MODEL_CONFIG, packaged_weights
+from extrap_train.diffusion.published.meaning import SCHEDULER, require_same_meaning
 from extrap_train.diffusion.published.read import SOURCES, Shapes, read_published, weights_at
 from extrap_train.diffusion.transfer import narrowed, turned_pose, widened
 from extrap_train.errors import InputError
@@ -176,6 +177,10 @@ def load_weights(
     new channels then say nothing yet, so that only what is `to_train` may.
     """
     networks = model.parts()
+    if is_own(path):
+        _require_same_start(path, model.config)
+    else:
+        require_same_meaning(path, {**networks, SCHEDULER: model.schedule}, to_train=to_train)
     wanted = {
         part: {name: x.shape for name, x in network.state_dict().items()}
         for part, network in networks.items()
@@ -196,6 +201,22 @@ def load_weights(
         unet["conv_in.weight"] = widened(unet["conv_in.weight"], channels)
     for part, (part_file, tensors) in found.items():
         part_file.fill(networks[part], tensors)
+
+
+def _require_same_start(path: Path, config: ModelConfig) -> None:
+    """InputError where the same tensors would mean something else than they do in a saved model."""
+    saved = saved_config(path)
+    keys = ("prediction", "unet.heads", "unet.norm_groups", "clip.heads")
+    if saved.family == config.family:
+        keys += ("residual",)
+    before, now = dotted(asdict(saved)), dotted(asdict(config))
+    for key in keys:
+        if before.get(key) != now.get(key):
+            raise InputError(
+                f"{path / MODEL_CONFIG}: was trained with {key}={before.get(key)}, and its weights "
+                f"mean nothing with model.{key}={now.get(key)}: give it that value, or "
+                "model.start=null"
+            )
 
 
 def _family(path: Path, file: WeightFile, conv_in: Tensor) -> str:

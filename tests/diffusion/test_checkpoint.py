@@ -5,6 +5,7 @@ import json
 import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -53,6 +54,32 @@ def test_weights_of_another_shape_are_refused(config: ModelConfig, tmp_path: Pat
     other = replace(config, octaves=5, start=str(tmp_path / "model"))
     with pytest.raises(InputError, match=r"another network's.*conv_in"):
         initial_model(other)
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"prediction": "v_prediction"}, "prediction=sample, .* model.prediction=v_prediction"),
+        ({"residual": False}, "residual=True, .* model.residual=False"),
+        ({"unet": {"heads": 4}}, "unet.heads=2, .* model.unet.heads=4"),
+        ({"unet": {"norm_groups": 8}}, "unet.norm_groups=16, .* model.unet.norm_groups=8"),
+    ],
+)
+def test_a_start_whose_tensors_would_mean_something_else_is_refused(
+    config: ModelConfig, tmp_path: Path, changed: dict[str, Any], said: str
+) -> None:
+    """Their names and shapes are the same."""
+    save_model(ExtrapolationModel(config), tmp_path / "model")
+    asked = changed | {"unet": replace(config.unet, **changed.get("unet", {}))}
+    with pytest.raises(InputError, match=said) as raised:
+        initial_model(replace(config, start=str(tmp_path / "model"), **asked))
+    assert "\n" not in str(raised.value)
+    assert "extrapolation_model.json" in str(raised.value)
+
+
+def test_the_packaged_base_starts_no_model_that_predicts_otherwise() -> None:
+    with pytest.raises(InputError, match=r"base.*prediction=sample.*or model\.start=null"):
+        initial_model(ModelConfig(name="small", prediction="v_prediction", start="base"))
 
 
 def test_a_start_without_geometry_is_told_it_without_effect(
