@@ -91,13 +91,23 @@ def write_whole(path: Path, content: bytes) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             temporary.write_bytes(content)
-            temporary.replace(path)
+            replace_whole(temporary, path)
         finally:
             temporary.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(
             f"{path}: cannot be written ({error.strerror}); free space or choose another folder"
         ) from None
+
+
+def replace_whole(made: Path, path: Path) -> None:
+    """Let a file that is complete become `path`, on the same file system, once it is on the disk.
+
+    Renamed before, it could be there after a power cut with nothing in it.
+    """
+    _sync(made)
+    made.replace(path)
+    _sync(path.parent)
 
 
 def save_array(path: Path, array: Shaped[np.ndarray, "..."]) -> int:

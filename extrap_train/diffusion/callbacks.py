@@ -28,7 +28,7 @@ from rich.progress import (
 )
 from torch import Tensor
 
-from extrap_train.data.files import partial_beside, write_whole
+from extrap_train.data.files import partial_beside, replace_whole, write_whole
 from extrap_train.errors import InputError
 
 _KEPT = 2
@@ -40,13 +40,13 @@ class WholeCheckpointIO(TorchCheckpointIO):
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: Any = None
     ) -> None:
-        """Write under a temporary name, then rename."""
+        """Write under a temporary name, then rename what has reached the disk."""
         path = Path(path)
         temporary = partial_beside(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             torch.save(checkpoint, temporary)  # not by way of memory: it is 14 GB at full size
-            temporary.replace(path)
+            replace_whole(temporary, path)
         except (OSError, RuntimeError) as error:
             reason = str(error).splitlines()[0]
             raise InputError(

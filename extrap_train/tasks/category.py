@@ -42,7 +42,7 @@ from extrap_train.runs import (
     require_same_options,
     run_folder,
 )
-from extrap_train.tasks.results import Results, draw_curve, draw_views, is_finished, write_results
+from extrap_train.tasks.results import Finished, Results, draw_curve, draw_views, write_results
 from extrap_train.tasks.seen_before import require_unseen
 from extrap_train.tasks.training_data import data_module, prepared_data, validation_names
 from extrap_train.trained_on import TrainedOn
@@ -70,7 +70,8 @@ def run(config: TrainConfig) -> Path:
     require_unseen(config.model.start, trained_on)
     with _opened(folder, config, trained_on) as opening:
         if opening.is_finished:
-            console.print(f"already trained for {config.trainer.steps} steps: {folder.path}")
+            steps = Finished.read(folder).steps
+            console.print(f"already trained for {steps} steps: {folder.path}")
             return folder.path
         training = CategoryTraining(model, config, validation_names(data), distance)
         _train(training, data, opening.checkpoint, folder, seconds)
@@ -93,7 +94,8 @@ def _opened(folder: RunFolder, config: TrainConfig, trained_on: TrainedOn) -> It
             open_run(config, trained_on)
             point_latest(folder)
             newest = checkpoints(folder.checkpoints)[-1:]
-            opening = Opening(is_finished(folder, config), str(newest[0]) if newest else None)
+            is_over = folder.summary.is_file() and Finished.read(folder).answers(config)
+            opening = Opening(is_over, str(newest[0]) if newest else None)
             announce(folder.path, opening)
             yield opening
     except Timeout:

@@ -14,6 +14,7 @@ from rich.table import Table
 from extrap_train.config import TrainConfig
 from extrap_train.data.files import write_whole
 from extrap_train.diffusion.evaluation import Prediction, summarise
+from extrap_train.errors import InputError
 from extrap_train.pictures import contact_sheet, curve, error_map, mark_holes
 from extrap_train.runs import RunFolder
 
@@ -37,16 +38,33 @@ class Results:
     provenance: dict[str, Any]
 
 
-def is_finished(folder: RunFolder, config: TrainConfig) -> bool:
-    """Whether the summary is there for at least these steps and for this way of measuring.
+@dataclass(frozen=True)
+class Finished:
+    """What the summary of a finished run says of it."""
 
-    That the data are the same is `note_data`'s to see.
-    """
-    if not folder.summary.is_file():
-        return False
-    summary = json.loads(folder.summary.read_text())
-    same_measure = summary["provenance"]["validation"] == asdict(config.validation)
-    return same_measure and int(summary["steps"]) >= config.trainer.steps
+    steps: int
+    measured: dict[str, Any]
+    """The options under `validation` that it was measured with."""
+
+    @classmethod
+    def read(cls, folder: RunFolder) -> "Finished":
+        """Of a run that has a summary; InputError where that is damaged."""
+        try:
+            summary = json.loads(folder.summary.read_bytes())
+            return cls(int(summary["steps"]), dict(summary["provenance"]["validation"]))
+        except (ValueError, KeyError, TypeError) as error:
+            reason = f"{type(error).__name__}: {error}".splitlines()[0]
+            raise InputError(
+                f"{folder.summary}: is damaged ({reason}); delete it, and task=category measures "
+                "the run again"
+            ) from None
+
+    def answers(self, config: TrainConfig) -> bool:
+        """Whether it was trained for at least these steps and measured in this way.
+
+        That the data are the same is `open_run`'s to see.
+        """
+        return self.steps >= config.trainer.steps and self.measured == asdict(config.validation)
 
 
 def write_results(

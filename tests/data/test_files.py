@@ -217,3 +217,16 @@ def test_a_full_device_has_its_number_however_much_is_written(count):
     with pytest.raises(OSError) as caught:
         save_array(Path("/dev/full"), np.zeros(count, np.uint8))
     assert caught.value.errno == errno.ENOSPC
+
+
+def test_a_name_is_given_only_to_what_has_reached_the_disk(tmp_path, monkeypatch):
+    """Else a power cut leaves an empty file that counts as whole."""
+    synced = []
+
+    def noted(descriptor):
+        synced.append((Path(f"/proc/self/fd/{descriptor}").readlink(), path.exists()))
+
+    path = tmp_path / "whole"
+    monkeypatch.setattr(os, "fsync", noted)
+    write_whole(path, b"content")
+    assert synced == [(partial_beside(path), False), (tmp_path, True)]

@@ -2,6 +2,7 @@
 checkpoint.
 """
 
+import os
 from pathlib import Path
 
 import pytest
@@ -45,6 +46,16 @@ def test_a_checkpoint_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> N
     with pytest.raises(InputError, match="cannot be written"):
         WholeCheckpointIO().save_checkpoint({}, tmp_path / "file" / "step-00000002.ckpt")
     assert checkpoints(tmp_path) == [target]
+
+
+def test_a_checkpoint_has_its_name_only_once_it_is_on_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    were_there: list[bool] = []
+    target = tmp_path / "step-00000001.ckpt"
+    monkeypatch.setattr(os, "fsync", lambda _: were_there.append(target.exists()))
+    WholeCheckpointIO().save_checkpoint({"a": torch.ones(2)}, target)
+    assert were_there == [False, True]
 
 
 def test_a_checkpoint_with_code_in_it_is_refused(tmp_path: Path) -> None:
