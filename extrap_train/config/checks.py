@@ -17,6 +17,9 @@ _ACCELERATORS = ("auto", "cpu", "gpu", "cuda", "mps")
 _PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
 """Weights stay in single precision: in half, an optimiser's small steps would be lost."""
 
+_ON_PAIRS = ("average", "category", "validate")
+"""Tasks that prepare pairs of photographs."""
+
 BOUNDS: dict[str, tuple[float, float]] = {
     "seed": (0, 2**30),
     "threads": (1, math.inf),
@@ -70,6 +73,7 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "minutes": (0.001, 10_000),
     "orbit": (1, 360),
     "frames": (1, 10_000),
+    "painted_at_once": (1, 10_000),
     "lora.learning_rate": (1e-9, 1),
     "lora.rank": (1, 1024),
     "lora.virtual_references": (0, 1000),
@@ -128,8 +132,10 @@ def validate(config: TrainConfig | DataPrepConfig, tasks: tuple[str, ...]) -> No
         require_one_of("trainer.precision", config.trainer.precision, _PRECISIONS)
         require_one_of("trainer.accelerator", config.trainer.accelerator, _ACCELERATORS)
         _check_intervals(config.trainer)
-        _check_model(config.model, config.prep)
-        _check_groups(config)
+        _check_model(config.model)
+        if config.task in _ON_PAIRS:
+            _check_pairs(config.model, config.prep)
+            _check_groups(config)
         _check_completion(config)
         _check_sampler_of(config)
         if config.lora.virtual_references == 1:
@@ -177,7 +183,7 @@ def _check_prep(prep: PrepConfig) -> None:
         )
 
 
-def _check_model(model: ModelConfig, prep: PrepConfig) -> None:
+def _check_model(model: ModelConfig) -> None:
     if model.geometry and model.family != "ours":
         raise InputError(
             f"model.geometry=true, but model.family={model.family} is told no depth of the warp: "
@@ -188,13 +194,17 @@ def _check_model(model: ModelConfig, prep: PrepConfig) -> None:
             f"model.references={model.references}, but model.family={model.family} is told of the "
             "nearest alone: give model.references=1"
         )
+    _check_network(model)
+
+
+def _check_pairs(model: ModelConfig, prep: PrepConfig) -> None:
+    """A model's warps are made from what is prepared."""
     if prep.image_size != model.warp_size:
         raise InputError(
             f"prep.image_size={prep.image_size}, but warps are made at model.warp_scale="
             f"{model.warp_scale} times model.image_size={model.image_size}: give "
             f"prep.image_size={model.warp_size}"
         )
-    _check_network(model)
 
 
 def validate_model(model: ModelConfig) -> None:

@@ -54,3 +54,5 @@ class SceneOptions:
     """Degrees around the scene that `task=view` walks, instead of one pose."""
     frames: int = 24
     """Views along the orbit."""
+    painted_at_once: int = 16
+    """Views that are denoised at a time; fewer take less memory and give the same pictures."""

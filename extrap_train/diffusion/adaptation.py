@@ -1,5 +1,6 @@
 """Training a scene's adapter within a time budget, ended early by what is held out."""
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from extrap_train.diffusion.conditioning import Conditioning
 from extrap_train.diffusion.loss import Anchor, Unchanged, diffusion_loss, prediction_errors
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.schedule import solver_of
+from extrap_train.errors import InputError
 from extrap_train.views import PairBatch, combine
 
 _LEVELS = 4
@@ -79,6 +81,11 @@ def adapt(
     measure = _HeldOut(model, pairs.held_out_batch(), options.batch_size, sampler, fabric, anchored)
     dropout = _CONDITION_DROPOUT if _is_guided(sampler) else 0.0
     losses = [(0, measure())]
+    if not math.isfinite(losses[0][1]):
+        raise InputError(
+            "the model's error on the scene's own views is not finite (NaN); either its weights "
+            "are not: give other weights=, or trainer.precision is too low: give 32-true"
+        )
     average = _weights(adapter)
     best, best_step = _weights(adapter), 0
     step, ended = 0, "steps"

@@ -11,8 +11,10 @@ from torch import Tensor
 from extrap_train.config import SamplerConfig
 from extrap_train.data.module import with_warp
 from extrap_train.data.queries import query_batch, query_groups
+from extrap_train.device import autocast
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sample_views, view_generator
+from extrap_train.errors import InputError
 from extrap_train.views import Camera, View, Warp, combine
 
 
@@ -51,7 +53,8 @@ class ViewGenerator(Protocol):
 
         A query's noise follows from `seed` and its name alone: the picture depends neither on the
         queries beside it nor on their number, unless the model denoises several together. Raises
-        InputError for degenerate cameras and for views without depth.
+        InputError for degenerate cameras, for views without depth, and where what is painted is not
+        finite.
         """
         ...
 
@@ -66,6 +69,8 @@ class DiffusionGenerator:
     """Queries that are denoised at a time."""
     references: int | None = None
     """Most views that a query is warped from; None takes the model's number."""
+    precision: str = "32-true"
+    """What the network computes in, by the names of `trainer.precision`: `bf16-mixed` is faster."""
 
     @property
     def image_size(self) -> int:
@@ -121,13 +126,25 @@ class DiffusionGenerator:
         config = self.model.config
         size, most = config.warp_size, self.references or config.told_references
         device = next(self.model.parameters()).device
-        # Geometry keeps its precision where the caller lets the network run in less.
+        # Geometry keeps its precision where the network runs in less.
         with torch.autocast(device.type, enabled=False):
             batch, chosen = query_batch(references, queries, most, size)
             batch = with_warp(batch.to(device), config.image_size)
         batch = replace(batch, joint_views=joint_views)
         generators = [view_generator(seed, name) for name in names]
-        images = sample_views(self.model, batch, self.sampler, generators)
+        with autocast(device, self.precision):
+            images = sample_views(self.model, batch, self.sampler, generators)
+        _require_finite(images, names)
         assert batch.warp is not None
         made = GeneratedViews(images, batch.camera, batch.warp, chosen)
         return combine([made], lambda tensors: tensors[0].cpu())
+
+
+def _require_finite(images: Float[Tensor, "n 3 h w"], names: Sequence[str]) -> None:
+    odd = (~images.isfinite()).flatten(1).any(1).nonzero().flatten().tolist()
+    if odd:
+        raise InputError(
+            f"view {names[odd[0]]}: what the model painted is not finite (NaN); either its weights "
+            "are not, as after a training that diverged: give other weights=, or numbers became "
+            "too large for trainer.precision: give 32-true"
+        )

@@ -1,4 +1,4 @@
-"""How much memory training takes, known before it starts, and what to do where it is not there."""
+"""How much memory training takes, known before it starts, and what helps where it ends."""
 
 import weakref
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from torch.utils.weak import WeakIdKeyDictionary
 
-from extrap_train.config import ModelConfig, TrainerConfig
+from extrap_train.config import LoraConfig, ModelConfig, TrainerConfig
 from extrap_train.device import is_out_of_memory
 from extrap_train.diffusion.averages import TRACKED_WIDTHS
 from extrap_train.diffusion.denoiser import build_unet
@@ -136,23 +136,47 @@ def _bytes(tensors: Iterator[Tensor]) -> int:
 
 @contextmanager
 def advice_where_memory_ends(options: TrainerConfig) -> Iterator[None]:
-    """Turn running out of memory into one line with what helps; other errors pass."""
+    """Turn running out of memory in training into one line with what helps; other errors pass."""
+    remedies = [
+        (not options.gradient_checkpointing, "trainer.gradient_checkpointing=true"),
+        (options.batch_size > 1, f"trainer.batch_size={max(1, options.batch_size // 2)}"),
+        (options.ema_decay > 0, "trainer.ema_decay=0 (no averaged weights)"),
+    ]
+    with _one_line(f"at trainer.batch_size={options.batch_size}", remedies):
+        yield
+
+
+@contextmanager
+def advice_where_adapting_ends(lora: LoraConfig, trainer: TrainerConfig) -> Iterator[None]:
+    """`advice_where_memory_ends` for an adapter's training."""
+    remedies = [
+        (not trainer.gradient_checkpointing, "trainer.gradient_checkpointing=true"),
+        (lora.batch_size > 1, f"lora.batch_size={max(1, lora.batch_size // 2)}"),
+        (lora.convolutions, "lora.convolutions=false"),
+    ]
+    with _one_line(f"at lora.batch_size={lora.batch_size}", remedies):
+        yield
+
+
+@contextmanager
+def advice_where_painting_ends(at_once: int, trainer: TrainerConfig) -> Iterator[None]:
+    """`advice_where_memory_ends` for painting so many views at once."""
+    remedies = [
+        (at_once > 1, f"painted_at_once={max(1, at_once // 2)}"),
+        (torch.cuda.is_available() and trainer.accelerator != "cpu", "trainer.accelerator=cpu"),
+    ]
+    with _one_line(f"painting {at_once} at once", remedies):
+        yield
+
+
+@contextmanager
+def _one_line(where: str, remedies: list[tuple[bool, str]]) -> Iterator[None]:
+    """InputError with the first two remedies that are left, each with whether it is."""
     try:
         yield
     except (torch.OutOfMemoryError, MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):
             raise
-        raise InputError(
-            f"out of memory at trainer.batch_size={options.batch_size}: {_remedies(options)}"
-        ) from None
-
-
-def _remedies(options: TrainerConfig) -> str:
-    """The two options that help most, of those that are left."""
-    known = [
-        (not options.gradient_checkpointing, "trainer.gradient_checkpointing=true"),
-        (options.batch_size > 1, f"trainer.batch_size={max(1, options.batch_size // 2)}"),
-        (options.ema_decay > 0, "trainer.ema_decay=0 (no averaged weights)"),
-    ]
-    left = [remedy for helps, remedy in known if helps][:2]
-    return f"give {' or '.join(left)}" if left else "it takes a device with more memory"
+        left = [remedy for helps, remedy in remedies if helps][:2]
+        advice = f"give {' or '.join(left)}" if left else "it takes a device with more memory"
+        raise InputError(f"out of memory {where}: {advice}") from None

@@ -18,6 +18,7 @@ from rich.console import Console
 from extrap_train.config import TrainConfig, placed
 from extrap_train.data.module import PairModule
 from extrap_train.data.store import PreparedData
+from extrap_train.device import require_accelerator
 from extrap_train.diffusion.averages import PowerAverages
 from extrap_train.diffusion.callbacks import (
     AveragedWeights,
@@ -54,6 +55,7 @@ def run(config: TrainConfig) -> Path:
     Nothing of a run is begun or removed before its options, its start and its data are known to be
     good.
     """
+    require_accelerator(config.trainer.accelerator)
     console = Console(quiet=not is_first())
     quieten_lightning()
     distance, missing = lpips_or_reason(config.validation.lpips_weights)

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from filelock import FileLock, Timeout
 from rich.console import Console
 from tqdm import tqdm
@@ -31,6 +30,7 @@ from extrap_train.data.sequences import Sequence
 from extrap_train.data.synthetic import SyntheticScene, build_scene
 from extrap_train.depth.build import depth_source
 from extrap_train.diffusion.generator import DiffusionGenerator
+from extrap_train.diffusion.memory import advice_where_painting_ends
 from extrap_train.errors import InputError
 from extrap_train.reconstruction.completion import Step, Workshop, complete, map_of_inputs
 from extrap_train.reconstruction.exact import ExactDepth, ExactGenerator
@@ -51,7 +51,7 @@ from extrap_train.reconstruction.viewer import CloudViewer
 from extrap_train.runs import newest_run
 from extrap_train.tasks.completed import Completed, write_completed
 from extrap_train.tasks.scene_folder import require_same, result_folder
-from extrap_train.tasks.scene_inputs import required_scene, trained_model
+from extrap_train.tasks.scene_inputs import device_of, required_scene, trained_model
 from extrap_train.views import stack_cameras, stack_poses
 
 _NOT_PART_OF_THE_MAP = (
@@ -143,7 +143,8 @@ def _run(job: _Job, console: Console) -> None:
         return
     started = time.perf_counter()
     with _viewer(job, known, console) as viewer:
-        known = _completed(job, known, queries, workshop, viewer)
+        with advice_where_painting_ends(1, job.config.trainer):
+            known = _completed(job, known, queries, workshop, viewer)
         seconds["views"] = time.perf_counter() - started
         steps = load_steps(job.folder / "map", len(known))
         done = Completed(known, steps, job.unit, job.truth, seconds)
@@ -161,8 +162,7 @@ def _workshop(job: _Job) -> Workshop:
             config.complete,
             config.seed,
         )
-    model = trained_model(config)
-    model = model.to("cuda" if torch.cuda.is_available() else "cpu")
+    model = trained_model(config).to(device_of(config))
     generator = DiffusionGenerator(model, sampler_for(config.sampler, model.config))
     # A generated view brings no depth along.
     own = config.depth

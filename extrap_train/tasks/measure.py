@@ -9,6 +9,7 @@ from rich.console import Console
 
 from extrap_train.config import TrainConfig
 from extrap_train.data.store import PreparedData
+from extrap_train.device import require_accelerator
 from extrap_train.diffusion.checkpoint import saved_config
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.training import CategoryTraining
@@ -66,6 +67,7 @@ def measure(
 
 
 def _validator(config: TrainConfig) -> lightning.Trainer:
+    require_accelerator(config.trainer.accelerator)
     return lightning.Trainer(
         accelerator=config.trainer.accelerator,
         devices=1,

@@ -119,9 +119,11 @@ def draw_curve(folder: RunFolder) -> None:
 
 
 def without_nan(value: Any) -> Any:
-    """JSON has no NaN: a mean over no view at all becomes null."""
+    """JSON has no NaN: a mean over no view at all becomes null, wherever it stands."""
     if isinstance(value, dict):
         return {key: without_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_nan(item) for item in value]
     return None if isinstance(value, float) and math.isnan(value) else value
 
 

@@ -21,8 +21,9 @@ from extrap_train.data.scene_pairs import AdaptationPairs, adaptation_pairs
 from extrap_train.data.sequences import Sequence
 from extrap_train.diffusion.adaptation import Adaptation, adapt
 from extrap_train.diffusion.evaluation import score_images, summarise
-from extrap_train.diffusion.generator import DiffusionGenerator, GeneratedViews
+from extrap_train.diffusion.generator import GeneratedViews
 from extrap_train.diffusion.lora import add_adapter, base_hash, save_adapter, saved_base_hash
+from extrap_train.diffusion.memory import advice_where_adapting_ends
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError
 from extrap_train.metrics import Distance, lpips_or_reason
@@ -31,10 +32,12 @@ from extrap_train.tasks.results import without_nan
 from extrap_train.tasks.scene_folder import claimed, result_folder, scene_options, whole_result
 from extrap_train.tasks.scene_inputs import (
     SceneInputs,
-    fabric_of,
+    device_of,
     label_of,
     open_inputs,
     open_sequence,
+    painted,
+    painter,
     trained_model,
 )
 from extrap_train.views import View, stack_cameras
@@ -49,6 +52,11 @@ def run(config: TrainConfig) -> Path:
     console = Console()
     if config.adapter is not None:
         raise InputError("task=scene makes an adapter and takes none: leave adapter= out")
+    if config.trainer.compile:
+        raise InputError(
+            "trainer.compile=true: task=scene trains for minutes, of which compiling takes most: "
+            "leave it out"
+        )
     sequence = open_sequence(config)
     folder, options = result_folder(config, label_of(sequence)), _options(config)
     with claimed(folder, options, resume=config.resume):
@@ -61,8 +69,7 @@ def _run(
     config: TrainConfig, sequence: Sequence, folder: Path, options: dict[str, Any], console: Console
 ) -> None:
     distance, missing = lpips_or_reason(config.validation.lpips_weights)
-    fabric = fabric_of(config)
-    model = trained_model(config).to(fabric.device)
+    model = trained_model(config).to(device_of(config))
     inputs = open_inputs(config, sequence, model.config.warp_size)
     pairs = adaptation_pairs(
         inputs.views, model.config.told_references, config.lora.virtual_references, config.seed
@@ -73,9 +80,11 @@ def _run(
     if config.resume and _is_done(folder, asked):
         console.print("already adapted with these options")
         return
-    before = _generate(model, config, inputs, targets, fabric)
+    before = _generate(model, config, inputs, targets)
+    if config.trainer.gradient_checkpointing:
+        model.unet.enable_gradient_checkpointing()
     adapter = add_adapter(model, config.lora, config.seed)
-    with _bar() as bar:
+    with _bar() as bar, advice_where_adapting_ends(config.lora, config.trainer):
         task = bar.add_task("adapt", total=1.0, note="")
 
         def on_step(step: int, share: float) -> None:
@@ -89,15 +98,21 @@ def _run(
             sampler,
             seconds=60 * config.minutes,
             seed=config.seed,
-            fabric=fabric,
+            fabric=_fabric(config),
             on_step=on_step,
         )
-    after = _generate(model, config, inputs, targets, fabric)
+    after = _generate(model, config, inputs, targets)
     with whole_result(folder, options) as whole:
         save_adapter(adapter, whole / "adapter")
         measured = _measure(before, after, targets, whole, distance)
         _write(whole, asked, done, pairs, measured, missing)
     console.print(_said(done, measured))
+
+
+def _fabric(config: TrainConfig) -> Fabric:
+    """Device and precision of the training."""
+    precision: Any = config.trainer.precision
+    return Fabric(accelerator=config.trainer.accelerator, devices=1, precision=precision)
 
 
 def _options(config: TrainConfig) -> dict[str, Any]:
@@ -167,15 +182,11 @@ def _generate(
     config: TrainConfig,
     inputs: SceneInputs,
     targets: list[View],
-    fabric: Fabric,
 ) -> GeneratedViews | None:
     if not targets:
         return None
-    cameras = stack_cameras([view.camera for view in targets])
-    with fabric.autocast():
-        generator = DiffusionGenerator(model, sampler_for(config.sampler, model.config))
-        names = [view.name for view in targets]
-        return generator.generate(inputs.views, cameras, names, config.seed)
+    cameras, names = stack_cameras([v.camera for v in targets]), [v.name for v in targets]
+    return painted(painter(config, model), inputs.views, cameras, names, config)
 
 
 def _measure(

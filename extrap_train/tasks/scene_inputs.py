@@ -2,24 +2,27 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
+import torch
 from lightning.fabric import Fabric
 from rich.console import Console
 
 from data_prep.views import choose_frames, input_views
-from extrap_train.config import ModelConfig, SyntheticConfig, TrainConfig
+from extrap_train.config import ModelConfig, SyntheticConfig, TrainConfig, sampler_for
 from extrap_train.data.photographs import CATEGORY
 from extrap_train.data.scene import open_scene
 from extrap_train.data.sequences import Frame, Sequence
 from extrap_train.depth.build import depth_source
+from extrap_train.device import require_accelerator
 from extrap_train.diffusion.checkpoint import is_own, load_model, published_model
+from extrap_train.diffusion.generator import DiffusionGenerator, GeneratedViews
 from extrap_train.diffusion.lora import load_adapter
+from extrap_train.diffusion.memory import advice_where_painting_ends
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.packaged import packaged_name, packaged_names, packaged_weights
 from extrap_train.errors import InputError
 from extrap_train.runs import newest_run
-from extrap_train.views import View
+from extrap_train.views import Camera, View
 
 
 @dataclass(frozen=True)
@@ -146,8 +149,27 @@ def open_model(
     return model.eval()
 
 
-def fabric_of(config: TrainConfig) -> Fabric:
-    """Device and precision that the network runs with."""
-    options = config.trainer
-    precision: Any = options.precision
-    return Fabric(accelerator=options.accelerator, devices=1, precision=precision)
+def device_of(config: TrainConfig) -> torch.device:
+    """Where the network runs; InputError where there is no such device."""
+    require_accelerator(config.trainer.accelerator)
+    return Fabric(accelerator=config.trainer.accelerator, devices=1).device
+
+
+def painter(config: TrainConfig, model: ExtrapolationModel) -> DiffusionGenerator:
+    """What paints the scene's views with the model, as the options say."""
+    sampler = sampler_for(config.sampler, model.config)
+    return DiffusionGenerator(
+        model, sampler, config.painted_at_once, precision=config.trainer.precision
+    )
+
+
+def painted(
+    generator: DiffusionGenerator,
+    views: list[View],
+    cameras: Camera,
+    names: list[str],
+    config: TrainConfig,
+) -> GeneratedViews:
+    """The generator's views; InputError that says what to turn where memory ends."""
+    with advice_where_painting_ends(config.painted_at_once, config.trainer):
+        return generator.generate(views, cameras, names, config.seed)

@@ -19,12 +19,13 @@ from extrap_train.config import (
     ModelConfig,
     SamplerConfig,
     TrainConfig,
-    sampler_for,
+    TrainerConfig,
 )
 from extrap_train.data.posed import read_cameras
 from extrap_train.data.scene import open_scene
 from extrap_train.data.sequences import Sequence
 from extrap_train.depth.build import depth_source
+from extrap_train.device import fastest_device
 from extrap_train.diffusion.generator import DiffusionGenerator, GeneratedViews
 from extrap_train.errors import InputError, did_you_mean
 from extrap_train.geometry.orbits import LEAST_VIEWS, orbit_cameras
@@ -33,12 +34,14 @@ from extrap_train.pictures import contact_sheet, film, mark_holes, picture, pict
 from extrap_train.tasks.scene_folder import claimed, result_folder, scene_options, whole_result
 from extrap_train.tasks.scene_inputs import (
     SceneInputs,
-    fabric_of,
+    device_of,
     input_frames,
     label_of,
     open_inputs,
     open_model,
     open_sequence,
+    painted,
+    painter,
     trained_model,
 )
 from extrap_train.views import Camera, View, stack_cameras
@@ -65,13 +68,11 @@ def run(config: TrainConfig) -> None:
     query = _query(config, sequence)
     folder, options = result_folder(config, label_of(sequence)), scene_options(config)
     with claimed(folder, options, resume=config.resume):
-        fabric = fabric_of(config)
-        model = trained_model(config).to(fabric.device)
+        model = trained_model(config).to(device_of(config))
         inputs = open_inputs(config, sequence, model.config.warp_size, config.pose)
         cameras, truth = _cameras(query, inputs.views, config, model.config.image_size)
-        with fabric.autocast():
-            generator = DiffusionGenerator(model, sampler_for(config.sampler, model.config))
-            made = generator.generate(inputs.views, cameras, query.names, config.seed)
+        generator = painter(config, model)
+        made = painted(generator, inputs.views, cameras, query.names, config)
         with whole_result(folder, options) as whole:  # nothing of another pose's stays in it
             _write(made, inputs.views, query.names, whole, walk=config.orbit is not None)
             if truth is not None:
@@ -93,12 +94,17 @@ def open_generator(
     adapter: str | None = None,
     sampler: SamplerConfig | None = None,
     config: ModelConfig | None = None,
+    *,
+    device: torch.device | str | None = None,
+    precision: str = TrainerConfig.precision,
 ) -> DiffusionGenerator:
     """The generator of a model folder, of a packaged model, or of a published checkpoint, which
     `config` describes; without `sampler` it samples as the model recommends.
+
+    It runs where and in what the commands do: on the GPU where there is one, in `bf16-mixed`.
     """
-    model = open_model(weights, adapter, config)
-    return DiffusionGenerator(model, sampler or model.config.sampler)
+    model = open_model(weights, adapter, config).to(device or fastest_device())
+    return DiffusionGenerator(model, sampler or model.config.sampler, precision=precision)
 
 
 def open_views(

@@ -17,6 +17,7 @@ from extrap_train.data.scene_pairs import adaptation_pairs
 from extrap_train.diffusion.adaptation import Adaptation, adapt
 from extrap_train.diffusion.lora import add_adapter, load_adapter, save_adapter
 from extrap_train.diffusion.loss import diffusion_loss
+from extrap_train.diffusion.memory import LiveBytes
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sample_views, view_generator
 from extrap_train.errors import InputError
@@ -131,19 +132,20 @@ def _adapt(
     config: ModelConfig, seconds: float = 1e9, **options: Any
 ) -> tuple[ExtrapolationModel, Adaptation]:
     model = _model(config)
-    chosen = replace(OPTIONS, **options)
-    adapter = add_adapter(model, chosen, seed=0)
-    done = adapt(
+    return model, _adapted(model, replace(OPTIONS, **options), seconds)
+
+
+def _adapted(model: ExtrapolationModel, options: LoraConfig, seconds: float = 1e9) -> Adaptation:
+    return adapt(
         model,
-        adapter,
-        adaptation_pairs(walls(3), 3, chosen.virtual_references, seed=0),
-        chosen,
+        add_adapter(model, options, seed=0),
+        adaptation_pairs(walls(3), 3, options.virtual_references, seed=0),
+        options,
         SamplerConfig(),
         seconds=seconds,
         seed=0,
         fabric=Fabric(accelerator="cpu", devices=1),
     )
-    return model, done
 
 
 def test_adapting_learns_the_scene_repeatably_and_keeps_the_best(config: ModelConfig) -> None:
@@ -156,6 +158,20 @@ def test_adapting_learns_the_scene_repeatably_and_keeps_the_best(config: ModelCo
     assert done.best_step > 0
     assert losses[done.best_step] == min(losses.values()) < losses[0]
     assert done.ended == "steps"
+
+
+def test_gradient_checkpointing_learns_the_same_with_less_memory(config: ModelConfig) -> None:
+    unet = replace(config.unet, channels=[32, 64])
+    peaks, losses = [], []
+    for checkpointing in (False, True):
+        model = _model(replace(config, unet=unet))
+        if checkpointing:
+            model.unet.enable_gradient_checkpointing()
+        with LiveBytes(model.parameters()) as live:
+            losses.append(_adapted(model, replace(OPTIONS, steps=1, batch_size=8)).losses)
+        peaks.append(live.peak)
+    assert losses[1] == losses[0]
+    assert peaks[1] < 0.8 * peaks[0]
 
 
 def test_it_ends_where_the_held_out_pair_gains_no_more_or_the_time_is_up(
