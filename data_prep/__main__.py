@@ -11,8 +11,9 @@ def _run(config: DataPrepConfig) -> None:
     from rich.console import Console
 
     from data_prep.report import write_report
-    from extrap_train.tasks.prepare import prepare_category
+    from extrap_train.tasks.prepare import check_members, prepare_category
 
+    check_members(config.category, config.data)
     for member in config.category.members:
         prepared = prepare_category(
             member,

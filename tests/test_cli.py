@@ -9,6 +9,7 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -97,6 +98,21 @@ def test_a_run_is_not_begun_on_data_that_are_none(
     (tmp_path / "co3d").mkdir()
     options = ["category=hydrant", "data=co3d", f"data.root={tmp_path / 'co3d'}", "run=mine"]
     assert "has no category" in _error([*options, "model.start=null"], monkeypatch, tmp_path)
+
+
+@pytest.mark.parametrize("command", [main, prepare])
+def test_no_member_is_prepared_where_another_is_missing(
+    command: Callable[[], None], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The one that is there is not even read: its annotations would be refused."""
+    (tmp_path / "co3d/apple").mkdir(parents=True)
+    (tmp_path / "co3d/apple/frame_annotations.jgz").touch()
+    options = ["category=all", "data=co3d", f"data.root={tmp_path / 'co3d'}"]
+    start = ["model.start=null"] if command is main else []
+    monkeypatch.setattr(sys, "argv", ["it", *options, *start, f"output={tmp_path / 'out'}"])
+    with pytest.raises(SystemExit, match="has no category 'book'; categories present: apple"):
+        command()
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_run_is_not_removed_before_there_is_another(

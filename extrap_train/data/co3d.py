@@ -38,12 +38,17 @@ def list_categories(root: Path) -> list[str]:
     return sorted(file.parent.name for file in root.glob(f"*/{FRAME_ANNOTATIONS}"))
 
 
-def read_category(root: Path, category: str) -> list[Sequence]:
-    """All sequences of a category, by name; frames by number, those without a camera left out."""
+def require_category(root: Path, category: str) -> None:
+    """InputError where the folder does not hold the category; says which ones it does."""
     known = list_categories(root)
     if category not in known:
         present = ", ".join(known) or f"none (no folder in it has a {FRAME_ANNOTATIONS})"
         raise InputError(f"{root}: has no category {category!r}; categories present: {present}")
+
+
+def read_category(root: Path, category: str) -> list[Sequence]:
+    """All sequences of a category, by name; frames by number, those without a camera left out."""
+    require_category(root, category)
     file = root / category / FRAME_ANNOTATIONS
     with _collector_paused():
         details = read_sequence_annotations(root / category / SEQUENCE_ANNOTATIONS)

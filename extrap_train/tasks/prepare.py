@@ -17,6 +17,7 @@ from data_prep.pairs import pair_options
 from data_prep.synthesize import synthesize
 from data_prep.tools import Tools
 from extrap_train.config import (
+    CategoryConfig,
     Co3dConfig,
     DataConfig,
     DatasetDepthConfig,
@@ -28,7 +29,7 @@ from extrap_train.config import (
     SyntheticConfig,
     placed,
 )
-from extrap_train.data.co3d import read_category
+from extrap_train.data.co3d import read_category, require_category
 from extrap_train.data.sequences import Sequence
 from extrap_train.data.set_lists import read_sequence_split
 from extrap_train.data.store import PreparedData
@@ -36,6 +37,13 @@ from extrap_train.jobs import Launcher
 from extrap_train.jobs.build import open_launcher
 
 LOCAL = LocalConfig()
+
+
+def check_members(category: CategoryConfig, data: DataConfig) -> None:
+    """InputError where a member is not there: before minutes go into those ahead of it."""
+    if isinstance(data, Co3dConfig) and data.root is not None:
+        for member in category.members:
+            require_category(Path(data.root), member)
 
 
 def prepare_category(

@@ -7,11 +7,12 @@ from extrap_train.data.examples import ExampleReader
 from extrap_train.data.module import PairModule
 from extrap_train.data.store import PreparedData
 from extrap_train.errors import InputError
-from extrap_train.tasks.prepare import prepare_category
+from extrap_train.tasks.prepare import check_members, prepare_category
 
 
 def prepared_data(config: TrainConfig) -> list[PreparedData]:
     """Every member category, prepared now or before."""
+    check_members(config.category, config.data)
     return [
         prepare_category(
             member,
