@@ -17,6 +17,7 @@ from extrap_train.metrics import lpips_or_reason
 from extrap_train.runs import RunFolder, provenance
 from extrap_train.tasks.category import quieten_lightning
 from extrap_train.tasks.results import Results, write_results
+from extrap_train.tasks.saved_model import require_as_said
 from extrap_train.tasks.seen_before import require_unseen
 from extrap_train.tasks.training_data import data_module, prepared_data, validation_names
 from extrap_train.trained_on import TrainedOn
@@ -34,10 +35,12 @@ class RunData:
     def of(cls, trained: RunFolder, config: TrainConfig) -> "RunData":
         """InputError where the options and what lies there today are not what it was trained on."""
         started = time.perf_counter()
+        saved = saved_config(trained.model)
+        require_as_said(saved, config.model, trained.model)
         prepared = prepared_data(config)
         today = TrainedOn.of(config.category.members, prepared)
         today.require_same(trained.data, "measure another run=NAME, or train one anew")
-        require_unseen(saved_config(trained.model).start, today)
+        require_unseen(saved.start, today)
         return cls(prepared, time.perf_counter() - started)
 
 

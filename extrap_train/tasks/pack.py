@@ -10,7 +10,7 @@ from extrap_train.diffusion.checkpoint import load_model, save_compact
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.packaged import packaged_name, packaged_weights
 from extrap_train.runs import existing_run
-from extrap_train.tasks.scene_inputs import open_model
+from extrap_train.tasks.scene_inputs import model_of
 
 _BASE = "base"
 
@@ -18,9 +18,7 @@ _BASE = "base"
 def run(config: TrainConfig) -> None:
     """Write the newest (or `weights`) model under the name that the package gives it."""
     console = Console()
-    model = open_model(
-        config.weights or str(existing_run(config).model), config.adapter, config.model
-    )
+    model = model_of(config, config.weights or str(existing_run(config).model))
     name = packaged_name(model.config.family, config.category.name)
     folder = Path(config.output) / "packed" / name
     folder.parent.mkdir(parents=True, exist_ok=True)

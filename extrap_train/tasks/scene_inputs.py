@@ -14,7 +14,7 @@ from extrap_train.data.scene import open_scene
 from extrap_train.data.sequences import Frame, Sequence
 from extrap_train.depth.build import depth_source
 from extrap_train.device import require_accelerator
-from extrap_train.diffusion.checkpoint import is_own, load_model, published_model
+from extrap_train.diffusion.checkpoint import is_own, load_model, published_model, saved_config
 from extrap_train.diffusion.generator import DiffusionGenerator, GeneratedViews
 from extrap_train.diffusion.lora import load_adapter
 from extrap_train.diffusion.memory import advice_where_painting_ends
@@ -22,6 +22,7 @@ from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.packaged import packaged_name, packaged_names, packaged_weights
 from extrap_train.errors import InputError
 from extrap_train.runs import newest_run
+from extrap_train.tasks.saved_model import require_as_said, require_described
 from extrap_train.views import Camera, View
 
 
@@ -94,11 +95,23 @@ def trained_model(config: TrainConfig) -> ExtrapolationModel:
     Before there is a run, the packaged model of the category takes its place, which is said.
     """
     if config.weights is not None:
-        return open_model(config.weights, config.adapter, config.model)
+        return model_of(config, config.weights)
     name, newest = named_weights(config), newest_run(config).model
     if not newest.is_dir():
         Console(stderr=True).print(f"{newest}: there is none yet; weights={name}, of the package")
-    return open_model(name, config.adapter)
+    return model_of(config, name)
+
+
+def model_of(config: TrainConfig, weights: str) -> ExtrapolationModel:
+    """The model that a command uses: as it was saved, or a published one, as `model` describes it.
+
+    Raises InputError for an option of the command line that a saved model contradicts.
+    """
+    folder = _folder_of(weights)
+    if not is_own(folder):
+        return open_model(weights, config.adapter, config.model)
+    require_as_said(saved_config(folder), config.model, folder)
+    return open_model(weights, config.adapter)
 
 
 def named_weights(config: TrainConfig) -> str:
@@ -131,11 +144,12 @@ def open_model(
     upon it if any.
 
     A published checkpoint says not what it is: it is read as the model that `config` describes.
+    InputError where that is another than the saved one.
     """
-    path = Path(weights)
-    if not path.exists():
-        path = packaged_weights(weights, "weights")
+    path = _folder_of(weights)
     if is_own(path):
+        if config is not None:
+            require_described(saved_config(path), config, path)
         model = load_model(path)
     elif config is not None:
         model = published_model(weights, config)
@@ -147,6 +161,12 @@ def open_model(
     if adapter is not None:
         load_adapter(model, Path(adapter))
     return model.eval()
+
+
+def _folder_of(weights: str) -> Path:
+    """What `weights` names: a path, or the folder of a packaged model."""
+    path = Path(weights)
+    return path if path.exists() else packaged_weights(weights, "weights")
 
 
 def device_of(config: TrainConfig) -> torch.device:
