@@ -15,7 +15,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from data_prep.correct import METHOD as CORRECTION_METHOD
 from data_prep.filter import judge_all
-from data_prep.frames import METHOD, CaptureKeys
+from data_prep.frames import METHOD, CaptureKeys, too_many_unusable
 from data_prep.reasons import kinds_of
 from data_prep.split import Split, split_sequences
 from data_prep.tables import Outcome, write_results
@@ -64,6 +64,7 @@ class _Plan:
             capture_keys.append(keys.frames_key(depth, size))
             qualities = [sequence.viewpoint_quality, sequence.point_cloud_quality]
             traits = [sequence.category, sequence.name, qualities, keys.content, keys.sizes]
+            traits += [len(sequence.left_out)] if sequence.left_out else []
             digest.update(json.dumps(traits).encode())
         return cls(sequences, capture_keys, shop, test_names, digest.hexdigest())
 
@@ -212,14 +213,21 @@ def _nothing_left(outcomes: list[Outcome]) -> str:
     kinds = kinds_of(o.verdict.reason.removeprefix(f"sequence {o.name}: ") for o in outcomes)
     listed = "; ".join(kind.counted for kind in kinds[:3])
     remedies = ["add sequences"]
-    if not all(outcome.failed for outcome in outcomes):
+    damaged = [_is_damaged(outcome) for outcome in outcomes]
+    if not all(damaged):
         remedies.insert(0, "loosen prep.* (prep.full_circle=ignore keeps partial turns)")
-    if any(outcome.failed for outcome in outcomes):
+    if any(damaged):
         remedies.insert(0, "mend what is named")
     return (
         f"none of the {len(outcomes)} sequences of {outcomes[0].sequence.category} can be used: "
         f"{listed}. To go on, {' or '.join(remedies)}"
     )
+
+
+def _is_damaged(outcome: Outcome) -> bool:
+    """Whether no option could keep the sequence."""
+    sequence = outcome.sequence
+    return outcome.failed or bool(too_many_unusable(sequence.left_out, sequence))
 
 
 def _disk_full(folder: Path, sequences: ListOf[Sequence], options: PrepConfig) -> str:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from data_prep.frames import too_many_unusable
 from extrap_train.config import PrepConfig
 from extrap_train.data.sequences import Sequence
 from extrap_train.data.validation import is_degenerate
@@ -57,6 +58,8 @@ def judge_all(sequences: ListOf[Sequence], options: PrepConfig) -> list[Verdict]
 def judge(sequence: Sequence, options: PrepConfig) -> Verdict:
     """Keep or drop a sequence; a quality that the capture does not state is no reason."""
     count = len(sequence.frames)
+    if too_many := too_many_unusable(sequence.left_out, sequence):
+        return Verdict(False, too_many, count)
     circle = options.full_circle != "ignore"
     least = MIN_FRAMES if circle else 2
     if count < least:

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import logging
+from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -103,18 +104,25 @@ def _remedy(source: DepthSource) -> str:
 
 
 def _usable_views(sequence: Sequence, where: str, size: int, *, depth: bool) -> list[View]:
-    views, reasons = [], []
+    views, reasons = [], list(sequence.left_out)
     for frame in sequence.frames:
         try:
             views.append(replace(object_square(frame.load(depth=depth), size), name=frame.name))
         except InputError as error:
             reasons.append(str(error))
-    if len(reasons) > MOST_UNUSABLE_SHARE * len(sequence.frames):
-        count = f"{len(reasons)} of {len(sequence.frames)} frames cannot be used"
-        raise InputError(f"{where}: {count}, the first because of {reasons[0]}")
+    if too_many := too_many_unusable(reasons, sequence):
+        raise InputError(f"{where}: {too_many}")
     if reasons:
         LOG.warning("%s: %d frames left out: %s", where, len(reasons), reasons[0])
     return views
+
+
+def too_many_unusable(reasons: ListOf[str], sequence: Sequence) -> str:
+    """Why a sequence is not trusted with these unusable frames, one reason each; empty if it is."""
+    count = len(sequence.frames) + len(sequence.left_out)
+    if len(reasons) <= MOST_UNUSABLE_SHARE * count:
+        return ""
+    return f"{len(reasons)} of {count} frames cannot be used, the first because of {reasons[0]}"
 
 
 def object_square(view: View, size: int) -> View:

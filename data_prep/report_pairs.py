@@ -49,7 +49,7 @@ def correction_facts(data: PreparedData) -> dict[str, str]:
             f"median {middle:.1%}, 5 % and 95 % quantiles {low:.1%} and {high:.1%}"
         )
     for kind in kinds_of(pairs.uncorrected[~moved])[:6]:
-        facts[f"left alone: {kind.count}"] = kind.short
+        facts[f"left alone because {kind.short}"] = str(kind.count)
     return facts
 
 

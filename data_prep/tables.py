@@ -153,7 +153,8 @@ def _frame_counts(outcome: Outcome, counts: _Counts) -> dict[str, int]:
     """Stored frames, and those that could not be used; of a dropped sequence all that it has."""
     taken = outcome.verdict.frames
     stored = counts.frames[outcome.name] if outcome.verdict.kept else taken
-    return {"frames": stored, "frames_left_out": taken - stored}
+    unread = len(outcome.sequence.left_out)
+    return {"frames": stored, "frames_left_out": taken - stored + unread}
 
 
 class _Rows:

@@ -44,7 +44,8 @@ def input_views(
 
     Depth is estimated from these frames alone, so that the others can serve as truth.
     """
-    part = replace(sequence, frames=tuple(sequence.frames[index] for index in chosen))
+    chosen_frames = tuple(sequence.frames[index] for index in chosen)
+    part = replace(sequence, frames=chosen_frames, left_out=())
     frames = make_frames(part, source, size, lone=False)
     return [
         View(

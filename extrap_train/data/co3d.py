@@ -9,6 +9,7 @@ import logging
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 
@@ -47,7 +48,10 @@ def require_category(root: Path, category: str) -> None:
 
 
 def read_category(root: Path, category: str) -> list[Sequence]:
-    """All sequences of a category, by name; frames by number, those without a camera left out."""
+    """All sequences of a category, by name; frames by number, those without a camera left out.
+
+    So are those whose camera is degenerate, and the sequences say so; InputError where all are.
+    """
     require_category(root, category)
     file = root / category / FRAME_ANNOTATIONS
     with _collector_paused():
@@ -72,22 +76,38 @@ def _collector_paused() -> Iterator[None]:
             gc.enable()
 
 
-def _posed_by_sequence(root: Path, file: Path) -> dict[str, list[Co3dFrames]]:
+@dataclass
+class _Posed:
+    """What one sequence has of frames with a camera."""
+
+    parts: list[Co3dFrames] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
+    """Why each of the others is: their camera is degenerate."""
+
+
+def _posed_by_sequence(root: Path, file: Path) -> dict[str, _Posed]:
     """The frames that have a camera; a sequence's entries need not stand together."""
-    posed: dict[str, list[Co3dFrames]] = defaultdict(list)
+    posed: dict[str, _Posed] = defaultdict(_Posed)
     entries, count = read_frame_annotations(file), 0
     while taken := _take(islice(entries, _ENTRIES_AT_A_TIME), posed, root, file):
         count += taken
-    without_camera = count - sum(len(part) for parts in posed.values() for part in parts)
+    sound = sum(len(part) for sequence in posed.values() for part in sequence.parts)
+    degenerate = [reason for sequence in posed.values() for reason in sequence.left_out]
+    without_camera = count - sound - len(degenerate)
     if without_camera:
         log.warning("%s: %d frames have no camera and are left out", file, without_camera)
     if not posed:
         raise InputError(f"{file}: no frame has a camera; choose another category")
+    if not sound:
+        count = f"none of the {len(degenerate)} frames of {file.parent.name} can be used"
+        raise InputError(f"{count}, the first because of {degenerate[0]}")
+    if degenerate:
+        log.warning("%d frames are left out, the first: %s", len(degenerate), degenerate[0])
     return posed
 
 
 def _take(
-    entries: Iterator[FrameAnnotation], posed: dict[str, list[Co3dFrames]], root: Path, file: Path
+    entries: Iterator[FrameAnnotation], posed: dict[str, _Posed], root: Path, file: Path
 ) -> int:
     """Add the entries that have a camera to `posed`, as columns; returns how many there were."""
     by_sequence: dict[str, list[FrameAnnotation]] = defaultdict(list)
@@ -97,29 +117,34 @@ def _take(
         if annotation.viewpoint is not None:
             by_sequence[annotation.sequence].append(annotation)
     for name, annotations in by_sequence.items():
-        posed[name].append(Co3dFrames.of(root, annotations, file))
+        part, left_out = Co3dFrames.of(root, annotations, file)
+        posed[name].parts.append(part)
+        posed[name].left_out.extend(left_out)
     return count
 
 
 def read_sequence(root: Path, category: str, name: str) -> Sequence:
-    """One sequence of a category."""
+    """One sequence of a category; InputError where none of its frames can be used."""
     sequences = {sequence.name: sequence for sequence in read_category(root, category)}
     if name not in sequences:
         raise InputError(
             f"{root / category}: has no sequence {name!r}; {did_you_mean(name, sequences)}"
         )
-    return sequences[name]
+    sequence = sequences[name]
+    if not sequence.frames:
+        raise InputError(f"{name}: none of its frames can be used: {sequence.left_out[0]}")
+    return sequence
 
 
 def _sequence(
     root: Path,
     category: str,
     name: str,
-    parts: list[Co3dFrames],
+    posed: _Posed,
     details: SequenceAnnotation | None,
     file: Path,
 ) -> Sequence:
-    frames = Co3dFrames.joined(parts)
+    frames = Co3dFrames.joined(posed.parts)
     if frames.has_duplicates:
         raise InputError(f"{file}: sequence {name} lists an image twice; remove the second entry")
     cloud = details.point_cloud_path if details else None
@@ -127,6 +152,7 @@ def _sequence(
         category=category,
         name=name,
         frames=frames,
+        left_out=tuple(posed.left_out),
         viewpoint_quality=details.viewpoint_quality if details else None,
         point_cloud_quality=details.point_cloud_quality if details else None,
         point_cloud=PointCloud(root, cloud) if cloud else None,

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Iterable
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import overload
 
@@ -13,7 +13,7 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from extrap_train.data.annotations import DepthFiles, FrameAnnotation
-from extrap_train.data.co3d_cameras import cameras_of
+from extrap_train.data.co3d_cameras import Cameras, cameras_of, frame_label
 from extrap_train.data.files import resolve_inside
 from extrap_train.data.images import (
     known_depth,
@@ -23,6 +23,7 @@ from extrap_train.data.images import (
     read_sixteen_bit,
 )
 from extrap_train.data.sequences import Frame
+from extrap_train.data.validation import degenerate_camera
 from extrap_train.views import Camera, View
 
 
@@ -78,16 +79,27 @@ class Co3dFrames(ListOf[Frame]):
     depth_scale: Float[np.ndarray, "n"]
 
     @classmethod
-    def of(cls, root: Path, annotations: list[FrameAnnotation], file: Path) -> "Co3dFrames":
-        """In the annotations' order; InputError that names `file` where a camera is degenerate."""
+    def of(
+        cls, root: Path, annotations: list[FrameAnnotation], file: Path
+    ) -> tuple["Co3dFrames", tuple[str, ...]]:
+        """In the annotations' order, and why some are left out: their camera is degenerate."""
         cameras = cameras_of(annotations, file)
+        frames = cls._of(root, annotations, cameras)
+        if cameras.sound.all():
+            return frames, ()
+        unsound = [annotations[i] for i in np.flatnonzero(~cameras.sound)]
+        reasons = tuple(degenerate_camera(frame_label(frame), file) for frame in unsound)
+        return frames._taken(cameras.sound), reasons
+
+    @classmethod
+    def _of(cls, root: Path, annotations: list[FrameAnnotation], cameras: Cameras) -> "Co3dFrames":
         depths = [annotation.depth for annotation in annotations]
         return cls(
             root=root,
             number=np.array([annotation.number for annotation in annotations], np.int64),
             size=np.array([annotation.size for annotation in annotations], np.int32),
-            world_to_cam=np.stack([camera.world_to_cam.numpy() for camera in cameras]),
-            intrinsics=np.stack([camera.intrinsics.numpy() for camera in cameras]),
+            world_to_cam=cameras.world_to_cam,
+            intrinsics=cameras.intrinsics,
             image_path=_encoded(annotation.image_path for annotation in annotations),
             mask_path=_encoded(annotation.mask_path for annotation in annotations),
             depth_path=_encoded(depth.path if depth else None for depth in depths),
@@ -98,12 +110,19 @@ class Co3dFrames(ListOf[Frame]):
     @classmethod
     def joined(cls, parts: ListOf["Co3dFrames"]) -> "Co3dFrames":
         """All frames of the parts, by number."""
-        order = np.argsort(np.concatenate([part.number for part in parts]), kind="stable")
-        names = [field.name for field in fields(cls) if field.name != "root"]
         columns = {
-            name: np.concatenate([getattr(part, name) for part in parts])[order] for name in names
+            name: np.concatenate([getattr(part, name) for part in parts]) for name in cls._columns()
         }
-        return cls(root=parts[0].root, **columns)
+        together = cls(root=parts[0].root, **columns)
+        return together._taken(np.argsort(together.number, kind="stable"))
+
+    @classmethod
+    def _columns(cls) -> list[str]:
+        return [field.name for field in fields(cls) if field.name != "root"]
+
+    def _taken(self, rows: Shaped[np.ndarray, "m"]) -> "Co3dFrames":
+        """These rows alone, by their indices or a mask."""
+        return replace(self, **{name: getattr(self, name)[rows] for name in self._columns()})
 
     @property
     def has_duplicates(self) -> bool:

@@ -58,6 +58,8 @@ class Sequence:
     name: str
     frames: ListOf[Frame]
     """In the order in which they were taken."""
+    left_out: tuple[str, ...] = ()
+    """Why others, which the capture lists, are none of them: a reason for each."""
     viewpoint_quality: float | None = None
     """CO3D's score of its camera poses; None where the capture has none."""
     point_cloud_quality: float | None = None

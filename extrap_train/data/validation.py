@@ -25,14 +25,19 @@ def is_degenerate(camera: Camera) -> Bool[Tensor, "*b"]:
     return ~(finite & (deviation < ROTATION_TOLERANCE) & right_handed & (focal > 0).all(-1))
 
 
+def degenerate_camera(name: str, file: Path) -> str:
+    """What to say of one that was read from `file`."""
+    return (
+        f"{file}: the camera of {name} is degenerate (NaN, no rotation, or a focal length that is "
+        "not positive); correct or remove its entry"
+    )
+
+
 def require_sound(cameras: Camera, names: Collection[str], file: Path) -> None:
     """Raise InputError that names the first degenerate camera of those read from `file`."""
     for name, degenerate in zip(names, is_degenerate(cameras).tolist(), strict=True):
         if degenerate:
-            raise InputError(
-                f"{file}: the camera of {name} is degenerate (NaN, no rotation, or a focal length "
-                "that is not positive); correct or remove its entry"
-            )
+            raise InputError(degenerate_camera(name, file))
 
 
 def require_list(content: Any, what: str, file: Path) -> list[Any]:

@@ -177,6 +177,35 @@ def test_degenerate_cameras(root, change, expected):
     assert expected in message
 
 
+def test_a_degenerate_camera_costs_its_frame_alone(tmp_path, caplog):
+    write_capture(tmp_path, names=("one", "two"), frames=3)
+    entries = frame_entries(tmp_path)
+    for entry in entries:
+        if entry["sequence_name"] == "one" and entry["frame_number"] != 11:
+            entry["viewpoint"]["R"][0][0] = float("nan")
+    replace_frame_entries(tmp_path, entries)
+    one, two = read_category(tmp_path, "cup")
+    assert [frame.name for frame in one.frames] == ["frame000011.jpg"]
+    assert len(one.left_out) == 2
+    assert all(f"{ANNOTATIONS}: the camera of one frame " in reason for reason in one.left_out)
+    assert [len(two.frames), two.left_out] == [3, ()]
+    assert "2 frames are left out, the first: " in caplog.text
+    assert one.frames[0].load().name == "frame000011.jpg"
+
+
+def test_a_sequence_without_a_sound_camera_is_empty_and_no_scene(tmp_path):
+    write_capture(tmp_path, names=("one", "two"), frames=2)
+    entries = frame_entries(tmp_path)
+    for entry in entries:
+        if entry["sequence_name"] == "one":
+            entry["viewpoint"]["focal_length"] = [0, 0]
+    replace_frame_entries(tmp_path, entries)
+    one, two = read_category(tmp_path, "cup")
+    assert [len(one.frames), len(one.left_out), len(two.frames)] == [0, 2, 2]
+    message = complaint(read_sequence, tmp_path, "cup", "one")
+    assert "one: none of its frames can be used: " in message
+
+
 def test_missing_image(root):
     (root / frame_entries(root)[0]["image"]["path"]).unlink()
     assert "frame000001.jpg: no such file" in complaint(load_first, root)

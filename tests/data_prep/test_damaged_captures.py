@@ -99,6 +99,37 @@ def test_damaged_sequences_are_reported_and_the_rest_goes_on(
     assert f"1 frames left out: {corrupt}" in caplog.text
 
 
+def test_degenerate_cameras_are_reported_and_the_rest_goes_on(photographs: Path) -> None:
+    entries = frame_entries(photographs)
+    spoilt = {("one_corrupt", 51), ("two_corrupt", 51), ("two_corrupt", 61)}
+    for entry in entries:
+        sequence, number = entry["sequence_name"], entry["frame_number"]
+        if (sequence, number) in spoilt or sequence == "no_depth":
+            entry["viewpoint"]["focal_length"] = [0, 0]
+    replace_frame_entries(photographs, entries)
+    data = prepared(photographs)
+    assert data.manifest["sequences"] == {"kept": 3, "dropped": 2, "failed": 0}
+    rows = data.sequences.set_index("sequence")
+    assert "12 of 12 frames cannot be used" in rows["reason"]["cup/no_depth"]
+    assert "2 of 12 frames cannot be used" in rows["reason"]["cup/two_corrupt"]
+    assert "annotations.jgz: the camera of two_corrupt frame" in rows["reason"]["cup/two_corrupt"]
+    assert rows.loc["cup/one_corrupt", ["frames", "frames_left_out"]].tolist() == [FRAMES - 1, 1]
+    sound = [entry for entry in entries if entry["viewpoint"]["focal_length"] != [0, 0]]
+    replace_frame_entries(photographs, sound)
+    assert prepared(photographs).manifest["sequences"] == {"kept": 4, "dropped": 0, "failed": 0}
+
+
+def test_unusable_cameras_and_photographs_count_together(photographs: Path) -> None:
+    entries = frame_entries(photographs)
+    for entry in entries:
+        if (entry["sequence_name"], entry["frame_number"]) == ("fine", 51):
+            entry["viewpoint"]["T"][0] = float("inf")
+    replace_frame_entries(photographs, entries)
+    cut_short(photographs, "fine", 8)
+    reason = prepared(photographs).sequences.set_index("sequence")["reason"]["cup/fine"]
+    assert "2 of 12 frames cannot be used" in reason
+
+
 def test_estimated_depth_needs_none_of_the_data_sets(photographs: Path) -> None:
     for file in (photographs / "cup").glob("*/depths/*.png"):
         file.write_bytes(b"no picture")

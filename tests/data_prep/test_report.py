@@ -1,4 +1,5 @@
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from rich.console import Console
 
 from data_prep.build import prepare
 from data_prep.report import coverage, write_report
-from data_prep.report_pairs import error_histogram, pair_sheet
+from data_prep.report_pairs import correction_facts, error_histogram, pair_sheet
 from extrap_train.config import FlowMatcherConfig, PrepConfig
 from extrap_train.data.store import Pairs, PreparedData
 from extrap_train.depth.dataset import DatasetDepth
@@ -114,6 +115,19 @@ def test_the_histogram_of_errors_counts_what_it_cuts_off() -> None:
     (axes,) = error_histogram(pairs).axes
     _, labels = axes.get_legend_handles_labels()
     assert labels == ["before (2 beyond 0.02)", "after (1 beyond 0.02)"]
+
+
+def test_reasons_that_are_equally_frequent_are_both_said(
+    data: PreparedData, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pairs = data.pairs("train")
+    half, odd = divmod(len(pairs), 2)
+    reasons = ["too few matches: 3"] * half + ["no gain"] * half + [""] * odd
+    uncorrected = replace(pairs, uncorrected=np.array(reasons))
+    monkeypatch.setattr(PreparedData, "pairs", lambda self, split: uncorrected)
+    facts = correction_facts(data)
+    assert facts["left alone because too few matches: #"] == str(half)
+    assert facts["left alone because no gain"] == str(half)
 
 
 def test_corrections_and_the_worst_pairs_are_shown(tmp_path: Path) -> None:
