@@ -43,7 +43,7 @@ def _error(arguments: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
         (["category=hydrant", "trainer.steps=0"], "trainer.steps=0: must be at least 1"),
         (["category=hydrant", "threads=0"], "threads=0: must be at least 1"),
         (["category=hydrant", "seed=-1"], "seed=-1: must be from 0"),
-        (["category=hydrant", "depth=stereo", "depth.planes=1"], "depth.planes=1: must be from 2"),
+        (["category=hydrant", "depth=stereo", "depth.planes=2"], "depth.planes=2: must be from 3"),
         (["category=hydrant", "depth=mast3r"], "depth.checkpoint is not given: give depth.check"),
         (
             ["category=hydrant", "depth=monocular", "matcher@depth.matcher=aliked"],

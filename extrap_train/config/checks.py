@@ -29,7 +29,7 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "data.frames": (2, 10_000),
     "data.image_size": (8, 8192),
     "data.seed": (0, 2**30),
-    "depth.planes": (2, 4096),
+    "depth.planes": (3, 4096),
     "depth.neighbours": (1, 64),
     "depth.image_size": (16, 8192),
     "depth.matcher.image_size": (16, 8192),

@@ -27,7 +27,7 @@ class StereoConfig(DepthConfig):
 
     name: str = "stereo"
     planes: int = 96
-    """Depth hypotheses, evenly spaced in inverse depth."""
+    """Depth hypotheses, evenly spaced in inverse depth; at least 3."""
     neighbours: int = 4
     """Other views that vote."""
     image_size: int = 256

@@ -34,7 +34,7 @@ def inverse_depth_range(
 
     Around the scene's centre; for cameras that look the same way, or away from it, from infinity
     to where the displacement between the images becomes too large. Depths that no neighbour sees
-    are cut off.
+    are cut off, but never so many that the range is empty.
     """
     center_depth = 0.0
     if center is not None:
@@ -56,7 +56,9 @@ def _seen(
     inverse_depth = candidates.to(camera.intrinsics)[:, None, None].expand(-1, 16, 16)
     seen = [projection_between(small, other).normalised(inverse_depth)[1] for other in neighbours]
     share = torch.stack(seen).any(0).float().mean((-2, -1))
-    used = candidates[share.cpu() >= LEAST_SEEN]
-    if not len(used):
+    used = (share.cpu() >= LEAST_SEEN).nonzero().flatten().tolist()
+    if not used:
         return float(candidates[0]), float(candidates[-1])
-    return float(used[0]), float(used[-1])
+    if len(used) == 1:  # the true depth lies around it
+        used = [max(used[0] - 1, 0), min(used[0] + 1, len(candidates) - 1)]
+    return float(candidates[used[0]]), float(candidates[used[-1]])
