@@ -44,7 +44,7 @@ def read_model(model: Path, images: Path, name: str) -> Sequence:
         raise InputError(f"{images_file}: lists no picture; run COLMAP again")
     paths = [check_relative(entry.name, images_file) for entry in entries]
     present = present_pictures(images, paths, images_file)
-    by_number = {camera.number: camera for camera in cameras}
+    by_number = _by_number(cameras, cameras_file)
     return sequence_of_photographs(
         images,
         name,
@@ -52,6 +52,15 @@ def read_model(model: Path, images: Path, name: str) -> Sequence:
         images_file,
         point_cloud=PointCloud(model, POINT_CLOUD),
     )
+
+
+def _by_number(cameras: list[ModelCamera], file: Path) -> dict[int, ModelCamera]:
+    found: dict[int, ModelCamera] = {}
+    for camera in cameras:
+        if camera.number in found:
+            raise InputError(f"{file}: lists camera {camera.number} twice; export the model again")
+        found[camera.number] = camera
+    return found
 
 
 def _photograph(entry: ModelImage, cameras: dict[int, ModelCamera], file: Path) -> Photograph:

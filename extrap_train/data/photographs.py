@@ -13,7 +13,7 @@ from torch import Tensor
 from extrap_train.data.files import resolve_inside
 from extrap_train.data.images import known_depth, read_image, read_mask, read_sixteen_bit
 from extrap_train.data.sequences import Frame, PointCloud, Sequence
-from extrap_train.data.validation import require_sound
+from extrap_train.data.validation import degenerate_camera, require_sound
 from extrap_train.errors import InputError
 from extrap_train.geometry.lens import Lens, undistort
 from extrap_train.views import Camera, View, stack_cameras
@@ -144,6 +144,8 @@ def pinhole_camera(photo: Photograph, description: Path) -> tuple[Lens, Camera]:
     """The camera of a photograph once its lens is undone; InputError where it is degenerate."""
     if not all(np.isfinite([*photo.lens.matrix.flat, *photo.lens.distortion])):
         raise InputError(f"{description}: the lens of {photo.image_path} is not finite; correct it")
+    if not (photo.lens.fx > 0 and photo.lens.fy > 0):  # or its distortion would be blamed
+        raise InputError(degenerate_camera(photo.image_path, description))
     try:
         pinhole = photo.lens.pinhole(photo.height, photo.width)
     except ValueError as error:

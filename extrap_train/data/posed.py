@@ -89,8 +89,11 @@ def _picture_path(folder: Path, entry: Any, index: int, file: Path) -> str:
     if not isinstance(path, str):
         raise InputError(f"{file}: expected {what}; correct the entry")
     path = posixpath.normpath(check_relative(path, file))
-    # Blender's scenes leave the suffix out.
-    return path if Path(path).suffix or (folder / path).is_file() else f"{path}.png"
+    if (folder / path).is_file():
+        return path
+    # Blender's scenes leave the suffix out, and a name may have a dot of its own.
+    whole = check_relative(f"{path}.png", file)
+    return path if Path(path).suffix and not (folder / whole).is_file() else whole
 
 
 def _photograph(folder: Path, path: str, entry: dict[str, Any], file: Path) -> Photograph:

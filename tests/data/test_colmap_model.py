@@ -164,6 +164,11 @@ def test_binary_files_that_lie(tmp_path, lie, expected):
         ("cameras.txt", "7 PINHOLE 40 x 50 50 20 16", "cameras.txt: line 1 is malformed"),
         ("cameras.txt", "7 PINHOLE 0 32 50 50 20 16", "size 32 x 0"),
         ("cameras.txt", "7 FOV 40 32 50 50 20 16 1", "camera model FOV is none of"),
+        (
+            "cameras.txt",
+            "7 PINHOLE 40 32 50 50 20 16\n7 PINHOLE 40 32 9 9 20 16",
+            "cameras.txt: lists camera 7 twice; export",
+        ),
         ("images.txt", "1 0 0 0 0 0 0 3 7 a.png\n\n", "is degenerate"),
         ("images.txt", "1 nan 0 0 0 0 0 3 7 a.png\n\n", "is degenerate"),
         ("images.txt", "1 1 0 0 0 0 0 3 seven a.png\n\n", "images.txt: line 1 is malformed"),

@@ -1,5 +1,6 @@
 import json
 import logging
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -125,6 +126,23 @@ def test_no_picture_at_all(folder):
     assert "none of the 3 pictures" in complaint(folder)
 
 
+@pytest.mark.parametrize("stem", ["plain", "r.a", "v1.5/r.2"])
+def test_the_suffix_of_a_picture_may_be_left_out(folder, stem):
+    content = read_json(folder)
+    for name in (stem, f"{stem}.png"):
+        content["frames"][0]["file_path"] = name
+        write_json(folder, content)
+        picture = folder / f"{stem}.png"
+        picture.parent.mkdir(exist_ok=True)
+        picture.write_bytes((folder / "images" / "000.png").read_bytes())
+        read = read_transforms(folder).frames
+        assert picture.name in [frame.name for frame in read]
+    picture.rename(folder / stem)
+    content["frames"][0]["file_path"] = stem
+    write_json(folder, content)
+    assert Path(stem).name in [frame.name for frame in read_transforms(folder).frames]
+
+
 def test_a_picture_outside_is_not_even_measured(folder):
     picture = folder / "images" / "001.png"
     picture.symlink_to(picture.rename(folder.parent / "outside.png"))
@@ -206,6 +224,9 @@ def test_pictures_of_the_same_name_in_two_folders(folder):
         ({"transform_matrix": np.zeros((4, 4)).tolist()}, "is degenerate"),
         ({"transform_matrix": np.full((4, 4), float("nan")).tolist()}, "is degenerate"),
         ({"fl_x": 0}, "is degenerate"),
+        ({"fl_x": 0, "k1": 0.1}, "is degenerate"),
+        ({"fl_y": -30, "k1": 0.1}, "is degenerate"),
+        ({"file_path": "n" * 253}, "has too long a name"),
         ({"fl_x": float("nan")}, "the lens of images/000.png is not finite"),
         ({"fl_x": "wide"}, "is malformed"),
         ({"fl_x": 10**400}, "is malformed"),
