@@ -39,6 +39,14 @@ def open_scene(spec: str, synthetic: SyntheticConfig | None = None) -> Sequence:
     return read_model(model, _images_folder(folder, model), folder.resolve().name)
 
 
+def scene_address(spec: str) -> str:
+    """What `spec` names as it is named from any folder: paths are absolute, through no links."""
+    if spec.startswith(SYNTHETIC_SCHEME):
+        return spec
+    scheme = CO3D_SCHEME if spec.startswith(CO3D_SCHEME) else ""
+    return f"{scheme}{Path(spec.removeprefix(scheme)).expanduser().resolve()}"
+
+
 def _open_co3d(spec: str) -> Sequence:
     path = Path(spec.removeprefix(CO3D_SCHEME)).expanduser()
     if len(path.parts) < 3:

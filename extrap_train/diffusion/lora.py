@@ -3,8 +3,9 @@
 import hashlib
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from torch import nn
 
 from extrap_train.config import LoraConfig
 from extrap_train.data.files import partial_beside, write_whole
+from extrap_train.diffusion.adapter_card import DENOISER, OTHERS, AdapterOrigin, model_card
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError
 
@@ -24,7 +26,8 @@ _CONVOLUTIONS = ["conv1", "conv2"]
 _WEIGHTS = "adapter_model.safetensors"
 _OPTIONS = "adapter_config.json"
 _BASE = "base.json"
-"""Beside peft's files: which weights the adapter was trained upon."""
+"""Beside peft's files: the weights that the adapter was trained upon, and its `AdapterOrigin`."""
+_CARD = "README.md"
 
 
 def add_adapter(model: ExtrapolationModel, options: LoraConfig, seed: int) -> peft.PeftModel:
@@ -53,14 +56,20 @@ def temporary_adapter(
         adapter.unload()
 
 
-def save_adapter(adapter: peft.PeftModel, folder: Path) -> None:
-    """Write a peft adapter folder, whole or not at all; an older one of that name is replaced."""
+def save_adapter(
+    model: ExtrapolationModel, adapter: peft.PeftModel, folder: Path, origin: AdapterOrigin
+) -> None:
+    """Write a peft adapter folder, whole or not at all; an older one of that name is replaced.
+
+    `adapter` is what lies upon the model's denoiser.
+    """
     temporary = partial_beside(folder)
     shutil.rmtree(temporary, ignore_errors=True)
     try:
         adapter.save_pretrained(str(temporary))
-        base = {"sha256": base_hash(adapter.get_base_model())}
-        write_whole(temporary / _BASE, json.dumps(base).encode())
+        hashes = base_hashes(model)
+        write_whole(temporary / _BASE, json.dumps(hashes | asdict(origin), indent=1).encode())
+        write_whole(temporary / _CARD, model_card(origin, hashes).encode())
         if folder.exists():
             shutil.rmtree(folder)
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -69,19 +78,33 @@ def save_adapter(adapter: peft.PeftModel, folder: Path) -> None:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def saved_base_hash(folder: Path) -> str | None:
-    """`base_hash` of the weights that a saved adapter is for; None where there is no adapter."""
+def saved_base_hashes(folder: Path) -> dict[str, str] | None:
+    """`base_hashes` of the weights that a saved adapter is for; None where there is no adapter."""
     try:
-        base = json.loads((folder / _BASE).read_text())["sha256"]
+        base = json.loads((folder / _BASE).read_text())
+        hashes = {key: base[key] for key in (DENOISER, OTHERS)}
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    return base if (folder / _WEIGHTS).is_file() else None
+    return hashes if (folder / _WEIGHTS).is_file() else None
+
+
+def saved_origin(folder: Path) -> AdapterOrigin | None:
+    """What a saved adapter was made from; None where it does not say, as older ones."""
+    try:
+        base = json.loads((folder / _BASE).read_text())
+        return AdapterOrigin(**{field.name: base[field.name] for field in fields(AdapterOrigin)})
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def load_adapter(model: ExtrapolationModel, folder: Path) -> peft.PeftModel:
-    """Put a saved adapter upon the denoiser; InputError where it was trained upon other weights."""
+    """Put a saved adapter upon the denoiser; InputError where it was trained upon other weights.
+
+    Older ones say nothing of other networks than the denoiser.
+    """
     try:
-        wanted = json.loads((folder / _BASE).read_text())["sha256"]
+        base = json.loads((folder / _BASE).read_text())
+        wanted = {DENOISER: base[DENOISER]} | {k: base[k] for k in (OTHERS,) if k in base}
         config = _saved_options(json.loads((folder / _OPTIONS).read_text()))
         weights = load_file(folder / _WEIGHTS)
     except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
@@ -89,7 +112,8 @@ def load_adapter(model: ExtrapolationModel, folder: Path) -> peft.PeftModel:
         raise InputError(
             f"adapter={folder}: is no adapter folder of task=scene ({reason}); make it anew"
         ) from None
-    if wanted != base_hash(model.unet):
+    own_hashes = base_hashes(model)
+    if any(own_hashes[key] != found for key, found in wanted.items()):
         raise InputError(
             f"adapter={folder}: was trained upon other weights than these; give weights= as it was "
             "then, or adapt these with task=scene"
@@ -118,11 +142,21 @@ def _saved_options(saved: dict[str, Any]) -> peft.LoraConfig:
     )
 
 
-def base_hash(unet: nn.Module) -> str:
-    """SHA-256 of the denoiser's own weights, whether or not an adapter lies upon them."""
+def base_hashes(model: ExtrapolationModel) -> dict[str, str]:
+    """SHA-256 of a model's own weights, whether or not an adapter lies upon them.
+
+    Of the denoiser, and of the networks whose outputs an adapter has learnt to read.
+    """
+    parts = model.parts()
+    others = [parts[name] for name in sorted(parts) if name != "unet"]
+    return {DENOISER: _hash([parts["unet"]]), OTHERS: _hash(others)}
+
+
+def _hash(networks: Iterable[nn.Module]) -> str:
     digest = hashlib.sha256()
-    for name, value in sorted(unet.state_dict().items()):
-        if ".lora_" not in name:
-            digest.update(name.replace(".base_layer", "").encode())
-            digest.update(value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy())
+    for network in networks:
+        for name, value in sorted(network.state_dict().items()):
+            if ".lora_" not in name:
+                digest.update(name.replace(".base_layer", "").encode())
+                digest.update(value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy())
     return digest.hexdigest()

@@ -17,12 +17,14 @@ from data_prep.views import target_views
 from extrap_train.config import SamplerConfig, TrainConfig, dotted, sampler_for
 from extrap_train.data.files import write_whole
 from extrap_train.data.module import spread
+from extrap_train.data.scene import scene_address
 from extrap_train.data.scene_pairs import AdaptationPairs, adaptation_pairs
 from extrap_train.data.sequences import Sequence
 from extrap_train.diffusion.adaptation import Adaptation, adapt
+from extrap_train.diffusion.adapter_card import AdapterOrigin
 from extrap_train.diffusion.evaluation import score_images, summarise
 from extrap_train.diffusion.generator import GeneratedViews
-from extrap_train.diffusion.lora import add_adapter, base_hash, save_adapter, saved_base_hash
+from extrap_train.diffusion.lora import add_adapter, base_hashes, save_adapter, saved_base_hashes
 from extrap_train.diffusion.memory import advice_where_adapting_ends
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError
@@ -34,10 +36,12 @@ from extrap_train.tasks.scene_inputs import (
     SceneInputs,
     device_of,
     label_of,
+    named_weights,
     open_inputs,
     open_sequence,
     painted,
     painter,
+    required_scene,
     trained_model,
 )
 from extrap_train.views import View, stack_cameras
@@ -103,7 +107,7 @@ def _run(
         )
     after = _generate(model, config, inputs, targets)
     with whole_result(folder, options) as whole:
-        save_adapter(adapter, whole / "adapter")
+        save_adapter(model, adapter, whole / "adapter", _origin(config, inputs, done))
         measured = _measure(before, after, targets, whole, distance)
         _write(whole, asked, done, pairs, measured, missing)
     console.print(_said(done, measured))
@@ -126,6 +130,17 @@ def _options(config: TrainConfig) -> dict[str, Any]:
     return scene_options(config) | dotted(adapting)
 
 
+def _origin(config: TrainConfig, inputs: SceneInputs, done: Adaptation) -> AdapterOrigin:
+    options = {"lora": asdict(config.lora), "minutes": config.minutes, "seed": config.seed}
+    return AdapterOrigin(
+        scene=scene_address(required_scene(config)),
+        inputs=[view.name for view in inputs.views],
+        weights=named_weights(config),
+        options=dotted(options),
+        outcome=_outcome(done),
+    )
+
+
 def _asked(
     config: TrainConfig,
     model: ExtrapolationModel,
@@ -141,7 +156,7 @@ def _asked(
         "views": _digest(views + targets),
         "weights": config.weights,
         "model": asdict(model.config),
-        "base": base_hash(model.unet),
+        "base": base_hashes(model),
         "depth": asdict(config.depth),
         "lora": asdict(config.lora),
         "sampler": asdict(sampler),
@@ -169,7 +184,7 @@ def _is_done(folder: Path, asked: dict[str, Any]) -> bool:
     except (OSError, ValueError, KeyError, TypeError):
         return False
     same = found == json.loads(json.dumps(asked))
-    return same and saved_base_hash(folder / "adapter") == asked["base"]
+    return same and saved_base_hashes(folder / "adapter") == asked["base"]
 
 
 def _targets(config: TrainConfig, inputs: SceneInputs, model: ExtrapolationModel) -> list[View]:
@@ -240,14 +255,18 @@ def _write(
 
 
 def _said(done: Adaptation, measured: dict[str, dict[str, float]]) -> str:
-    kept = f"kept step {done.best_step} of {done.steps}" if done.best_step else "kept the base"
-    text = f"ended by {done.ended} after {done.seconds:.0f} s, {kept}"
+    text = _outcome(done)
     if measured:
         one, other = measured["model"], measured["adapted"]
         text += f"; held-out views: PSNR {one['psnr']:.2f} → {other['psnr']:.2f} dB"
         if not math.isnan(one["lpips"]):
             text += f", LPIPS {one['lpips']:.3f} → {other['lpips']:.3f}"
     return text
+
+
+def _outcome(done: Adaptation) -> str:
+    kept = f"kept step {done.best_step} of {done.steps}" if done.best_step else "kept the base"
+    return f"ended by {done.ended} after {done.seconds:.0f} s, {kept}"
 
 
 def _bar() -> Progress:

@@ -11,7 +11,7 @@ from filelock import FileLock, Timeout
 
 from extrap_train.config import SyntheticConfig, TrainConfig, dotted
 from extrap_train.data.files import remove_partial, whole_folder, write_whole
-from extrap_train.data.scene import CO3D_SCHEME, SYNTHETIC_SCHEME
+from extrap_train.data.scene import SYNTHETIC_SCHEME, scene_address
 from extrap_train.errors import InputError
 from extrap_train.runs import given_name
 from extrap_train.tasks.scene_inputs import named_weights, required_scene
@@ -23,14 +23,6 @@ MADE_WITH = "made_with.json"
 def result_folder(config: TrainConfig, label: str) -> Path:
     """Where a task's result about a scene lies: called like the scene, or as `run` says."""
     return Path(config.output) / config.task / (given_name(config) or label)
-
-
-def scene_address(scene: str) -> str:
-    """The scene as it is named from any folder: paths are absolute, through no links."""
-    if scene.startswith(SYNTHETIC_SCHEME):
-        return scene
-    path = Path(scene.removeprefix(CO3D_SCHEME)).expanduser().resolve()
-    return f"{CO3D_SCHEME if scene.startswith(CO3D_SCHEME) else ''}{path}"
 
 
 def scene_options(config: TrainConfig) -> dict[str, Any]:

@@ -10,13 +10,14 @@ from rich.console import Console
 from data_prep.views import choose_frames, input_views
 from extrap_train.config import ModelConfig, SyntheticConfig, TrainConfig, sampler_for
 from extrap_train.data.photographs import CATEGORY
-from extrap_train.data.scene import open_scene
+from extrap_train.data.scene import open_scene, scene_address
 from extrap_train.data.sequences import Frame, Sequence
 from extrap_train.depth.build import depth_source
 from extrap_train.device import require_accelerator
+from extrap_train.diffusion.adapter_card import AdapterOrigin
 from extrap_train.diffusion.checkpoint import is_own, load_model, published_model, saved_config
 from extrap_train.diffusion.generator import DiffusionGenerator, GeneratedViews
-from extrap_train.diffusion.lora import load_adapter
+from extrap_train.diffusion.lora import load_adapter, saved_origin
 from extrap_train.diffusion.memory import advice_where_painting_ends
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.packaged import packaged_name, packaged_names, packaged_weights
@@ -92,8 +93,10 @@ def open_inputs(
 def trained_model(config: TrainConfig) -> ExtrapolationModel:
     """The model that `weights` names, with its adapter if any; by default the category's newest.
 
-    Before there is a run, the packaged model of the category takes its place, which is said.
+    Before there is a run, the packaged model of the category takes its place, which is said; so is
+    an adapter that was made for another scene.
     """
+    _say_whose(config)
     if config.weights is not None:
         return model_of(config, config.weights)
     name, newest = named_weights(config), newest_run(config).model
@@ -112,6 +115,20 @@ def model_of(config: TrainConfig, weights: str) -> ExtrapolationModel:
         return open_model(weights, config.adapter, config.model)
     require_as_said(saved_config(folder), config.model, folder)
     return open_model(weights, config.adapter)
+
+
+def adapter_origin(config: TrainConfig) -> AdapterOrigin | None:
+    """What the adapter was made from, if there is one and it says so."""
+    return None if config.adapter is None else saved_origin(Path(config.adapter))
+
+
+def _say_whose(config: TrainConfig) -> None:
+    origin, here = adapter_origin(config), scene_address(required_scene(config))
+    if origin is not None and origin.scene != here:
+        Console(stderr=True, soft_wrap=True).print(
+            f"adapter={config.adapter}: was made for {origin.scene}, not for {here}, which the "
+            "model alone may paint better"
+        )
 
 
 def named_weights(config: TrainConfig) -> str:

@@ -22,7 +22,7 @@ from extrap_train.config import (
     TrainerConfig,
 )
 from extrap_train.data.posed import read_cameras
-from extrap_train.data.scene import open_scene
+from extrap_train.data.scene import open_scene, scene_address
 from extrap_train.data.sequences import Sequence
 from extrap_train.depth.build import depth_source
 from extrap_train.device import fastest_device
@@ -34,6 +34,7 @@ from extrap_train.pictures import contact_sheet, film, mark_holes, picture, pict
 from extrap_train.tasks.scene_folder import claimed, result_folder, scene_options, whole_result
 from extrap_train.tasks.scene_inputs import (
     SceneInputs,
+    adapter_origin,
     device_of,
     input_frames,
     label_of,
@@ -45,6 +46,9 @@ from extrap_train.tasks.scene_inputs import (
     trained_model,
 )
 from extrap_train.views import Camera, View, stack_cameras
+
+_UNSEEN_SHARE = 0.02
+"""Of a view that the inputs show: with less it is as good as turned away."""
 
 
 @dataclass(frozen=True)
@@ -73,18 +77,39 @@ def run(config: TrainConfig) -> None:
         cameras, truth = _cameras(query, inputs.views, config, model.config.image_size)
         generator = painter(config, model)
         made = painted(generator, inputs.views, cameras, query.names, config)
+        _say_shares(made, query.names, console)
         with whole_result(folder, options) as whole:  # nothing of another pose's stays in it
             _write(made, inputs.views, query.names, whole, walk=config.orbit is not None)
             if truth is not None:
                 picture(truth.image, whole / "truth.png")
     if truth is not None:
-        console.print(_compared(made, truth, inputs))
+        console.print(_compared(made, truth, inputs, config))
     console.print(f"result: {folder}")
 
 
-def _compared(made: GeneratedViews, truth: View, inputs: SceneInputs) -> str:
+def _say_shares(made: GeneratedViews, names: list[str], console: Console) -> None:
+    """How much of each view the inputs show, which is what the picture can be trusted for."""
+    shares = made.warp.mask.flatten(1).mean(1).tolist()
+    least, most = (f"{100 * share:.0f}" for share in (min(shares), max(shares)))
+    which = names[0] if len(names) == 1 else "the views"
+    span = least if least == most else f"{least} to {most}"
+    console.print(f"the inputs show {span} % of {which}")
+    unseen = [name for name, share in zip(names, shares, strict=True) if share < _UNSEEN_SHARE]
+    if unseen:
+        more = f" and {len(unseen) - 1} more" if len(unseen) > 1 else ""
+        Console(stderr=True, soft_wrap=True).print(
+            f"the inputs show next to nothing of {unseen[0]}{more}, which is made up: does its "
+            "camera look at the scene, from near enough? A pose file has OpenGL's axes (+X right, "
+            "+Y up, −Z forward) and the scene's unit"
+        )
+
+
+def _compared(made: GeneratedViews, truth: View, inputs: SceneInputs, config: TrainConfig) -> str:
     if truth.name in {view.name for view in inputs.views}:
         return f"no PSNR: {truth.name} is an input itself; leave it out of input_frames"
+    origin = adapter_origin(config)
+    if origin and truth.name in origin.inputs and origin.scene == scene_address(str(config.scene)):
+        return f"no PSNR: the adapter was trained on {truth.name}"
     found = float(psnr(quantised(made.images), quantised(truth.image[None])))
     return f"PSNR against the photograph: {found:.2f} dB"
 

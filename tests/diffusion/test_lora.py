@@ -15,7 +15,14 @@ from torch import Tensor, nn
 from extrap_train.config import LoraConfig, ModelConfig, SamplerConfig
 from extrap_train.data.scene_pairs import adaptation_pairs
 from extrap_train.diffusion.adaptation import Adaptation, adapt
-from extrap_train.diffusion.lora import add_adapter, load_adapter, save_adapter
+from extrap_train.diffusion.adapter_card import AdapterOrigin
+from extrap_train.diffusion.lora import (
+    add_adapter,
+    base_hashes,
+    load_adapter,
+    save_adapter,
+    saved_origin,
+)
 from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.memory import LiveBytes
 from extrap_train.diffusion.model import ExtrapolationModel
@@ -24,6 +31,11 @@ from extrap_train.errors import InputError
 from extrap_train.views import PairBatch
 
 OPTIONS = LoraConfig(rank=2, convolutions=True, steps=12, validate_every=4, batch_size=4)
+
+
+ORIGIN = AdapterOrigin(
+    "/scenes/apple", ["a.jpg", "b.jpg"], "ours-apple", {"lora.rank": 2}, "kept step 4 of 12"
+)
 
 
 def _model(config: ModelConfig) -> ExtrapolationModel:
@@ -69,7 +81,7 @@ def test_it_comes_back_as_it_was_saved_and_goes_without_a_trace(
     adapter = _randomised(model)
     adapted = _painted(model, batch)
     assert (adapted - before).abs().max() > 1e-3
-    save_adapter(adapter, tmp_path / "adapter")
+    save_adapter(model, adapter, tmp_path / "adapter", ORIGIN)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["adapter"]
     adapter.unload()
     assert all(torch.equal(state[name], value) for name, value in model.state_dict().items())
@@ -80,7 +92,7 @@ def test_it_comes_back_as_it_was_saved_and_goes_without_a_trace(
 
 def test_plain_peft_reads_the_folder(config: ModelConfig, batch: PairBatch, tmp_path: Path) -> None:
     model = _model(config)
-    save_adapter(_randomised(model), tmp_path / "adapter")
+    save_adapter(model, _randomised(model), tmp_path / "adapter", ORIGIN)
     adapted = _painted(model, batch)
     fresh = _model(config)
     peft.PeftModel.from_pretrained(fresh.unet, str(tmp_path / "adapter"))
@@ -88,17 +100,50 @@ def test_plain_peft_reads_the_folder(config: ModelConfig, batch: PairBatch, tmp_
 
 
 def test_other_weights_and_other_folders_are_refused(config: ModelConfig, tmp_path: Path) -> None:
-    save_adapter(_randomised(_model(config)), tmp_path / "adapter")
+    model = _model(config)
+    save_adapter(model, _randomised(model), tmp_path / "adapter", ORIGIN)
     other = _model(config)
     nn.init.normal_(other.unet.conv_out.weight, std=0.1)
     with pytest.raises(InputError, match="was trained upon other weights"):
         load_adapter(other, tmp_path / "adapter")
+    unlike = _model(config)
+    nn.init.normal_(unlike.cc_projection.weight, std=0.1)  # what the adapted layers attend to
+    with pytest.raises(InputError, match="was trained upon other weights"):
+        load_adapter(unlike, tmp_path / "adapter")
     with pytest.raises(InputError, match="is no adapter folder of task=scene"):
         load_adapter(_model(config), tmp_path / "gone")
     weights = tmp_path / "adapter" / "adapter_model.safetensors"
     weights.write_bytes(weights.read_bytes()[:100])
     with pytest.raises(InputError, match="is no adapter folder of task=scene"):
         load_adapter(_model(config), tmp_path / "adapter")
+
+
+def test_an_adapter_says_what_it_was_made_from(config: ModelConfig, tmp_path: Path) -> None:
+    model = _model(config)
+    folder = tmp_path / "adapter"
+    save_adapter(model, _randomised(model), folder, ORIGIN)
+    assert saved_origin(folder) == ORIGIN
+    card = (folder / "README.md").read_text()
+    assert "More Information Needed" not in card
+    hashes = base_hashes(model)
+    for said in ("/scenes/apple", "`a.jpg`, `b.jpg`", "ours-apple", *hashes.values(), "rank=2"):
+        assert said in card
+
+
+def test_an_adapter_that_says_nothing_but_its_denoiser_still_loads(
+    config: ModelConfig, tmp_path: Path
+) -> None:
+    """As they were saved before."""
+    model = _model(config)
+    folder = tmp_path / "adapter"
+    save_adapter(model, _randomised(model), folder, ORIGIN)
+    (folder / "base.json").write_text(json.dumps({"sha256": base_hashes(model)["sha256"]}))
+    load_adapter(_model(config), folder)
+    assert saved_origin(folder) is None
+    other = _model(config)
+    nn.init.normal_(other.unet.conv_out.weight, std=0.1)
+    with pytest.raises(InputError, match="was trained upon other weights"):
+        load_adapter(other, folder)
 
 
 @pytest.mark.parametrize(
@@ -117,7 +162,8 @@ def test_other_weights_and_other_folders_are_refused(config: ModelConfig, tmp_pa
 def test_an_adapter_of_another_kind_is_refused_and_leaves_the_model_alone(
     config: ModelConfig, batch: PairBatch, tmp_path: Path, changed: dict[str, Any], said: str
 ) -> None:
-    save_adapter(_randomised(_model(config)), tmp_path / "adapter")
+    model = _model(config)
+    save_adapter(model, _randomised(model), tmp_path / "adapter", ORIGIN)
     file = tmp_path / "adapter" / "adapter_config.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | changed))
     model = _model(config)

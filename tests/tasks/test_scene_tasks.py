@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import shutil
 from pathlib import Path
 
@@ -88,6 +89,34 @@ def test_poses_come_from_a_file_with_any_lens(command, weights, tmp_path) -> Non
     assert (tmp_path / "view" / "hydrant-0000" / "views" / "000.png").is_file()
 
 
+def test_how_much_the_inputs_show_is_said_and_where_it_is_nothing_what_to_look_for(
+    command, weights, tmp_path, capsys
+) -> None:
+    """As of a camera whose file has other axes, or another unit."""
+    view = ["task=view", f"weights={weights}"]
+    command(*view, "pose=frame000003")
+    said = capsys.readouterr()
+    share = re.search(r"the inputs show (\d+) % of frame000003", said.out)
+    assert share
+    assert 5 < int(share[1]) <= 100
+    assert "made up" not in said.err
+    turned = torch.diag(torch.tensor([1.0, -1, -1, 1]))
+    turned[2, 3] = 4.0
+    far = torch.eye(4)
+    far[2, 3] = 160.0
+    for odd in (turned, far):
+        poses = _poses(tmp_path / "poses.json", 4.0, "front", "odd")
+        content = json.loads(poses.read_text())
+        content["frames"][1]["transform_matrix"] = odd.tolist()
+        poses.write_text(json.dumps(content))
+        command(*view, f"pose={poses}")
+        said = capsys.readouterr()
+        assert re.search(r"the inputs show [01] to \d+ % of the views", said.out)
+        assert "the inputs show next to nothing of odd, which is made up" in said.err
+        assert "OpenGL" in said.err
+        assert len(said.err.strip().splitlines()) == 1
+
+
 def test_pictures_of_all_names_lie_beside_each_other_and_nothing_else_does(
     command, refused, weights, tmp_path
 ) -> None:
@@ -130,8 +159,20 @@ def test_an_adapter_is_made_used_again_and_put_upon_the_weights(
     capsys.readouterr()
     command("task=scene", f"weights={weights}", *options)
     assert "already adapted with these options" in capsys.readouterr().out
-    adapter = f"adapter={folder / 'adapter'}"
-    command("task=view", f"weights={weights}", adapter, "pose=frame000003")
+    view = ["task=view", f"weights={weights}", f"adapter={folder / 'adapter'}"]
+    learnt, other = (
+        names[0] for names in (summary["asked"]["inputs"], summary["asked"]["held_out"])
+    )
+    command(*view, f"pose={other}")
+    said = capsys.readouterr()
+    assert "PSNR against the photograph" in said.out
+    assert "was made for" not in said.err
+    command(*view, f"pose={learnt}")
+    assert f"no PSNR: the adapter was trained on {learnt}" in capsys.readouterr().out
+    command(*view, f"pose={other}", "scene=synthetic:cup/0001")
+    said = capsys.readouterr()
+    assert "was made for synthetic:hydrant/0000, not for synthetic:cup/0001" in said.err
+    assert "PSNR against the photograph" in said.out
 
 
 def test_an_adapter_is_made_anew_for_other_weights_of_the_same_name(
