@@ -70,8 +70,12 @@ def error_histogram(pairs: Pairs) -> Figure:
 
 
 def pair_sheet(data: PreparedData, chosen: list[int], path: Path) -> None:
-    """Training pairs, a row each: reference, depth, warp without and with flow, query, error."""
-    batch = _batch(data, chosen)
+    """Training pairs, a row each: reference, depth, warp without and with flow, query, error.
+
+    Above each row stand its number, angle, sequence, reference and query.
+    """
+    pairs = data.pairs("train")
+    batch = _batch(data, pairs, chosen)
     plain, moved = (
         warp_references(
             batch.reference_images,
@@ -93,11 +97,15 @@ def pair_sheet(data: PreparedData, chosen: list[int], path: Path) -> None:
     columns["query"] = batch.image
     shown = torch.where(moved.mask[:, None] > 0, moved.image, batch.image)
     columns["error of the warp"] = error_map(shown, batch.image)
-    contact_sheet(columns, path)
+    rows = [_row(data, pairs, index) for index in chosen]
+    captions = [
+        f"{number}: {row['angle']}, {row['sequence']}, {row['reference']} → {row['query']}"
+        for number, row in enumerate(rows, start=1)
+    ]
+    contact_sheet(columns, path, captions)
 
 
-def _batch(data: PreparedData, chosen: list[int]) -> PairBatch:
-    training = data.pairs("train")
+def _batch(data: PreparedData, training: Pairs, chosen: list[int]) -> PairBatch:
     pairs = [training[index] for index in chosen]
     views = [data.frames(p.sequence, [p.references[0], p.query]) for p in pairs]
     images = torch.stack([images for images, _, _ in views])

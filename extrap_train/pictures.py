@@ -12,7 +12,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image, ImageDraw
+from matplotlib import font_manager
+from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from extrap_train.data.files import write_whole
@@ -21,6 +22,7 @@ from extrap_train.errors import InputError
 
 _HOLE_COLOUR = (1.0, 0.0, 1.0)
 _LEAST_TILE_PIXELS = 128
+_FONT_PIXELS = 10
 _PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 _STEM_BYTES = 200
 """With what is put behind it, a name stays one that every file system takes."""
@@ -55,30 +57,42 @@ def error_map(
     return (2 * error).clamp(0, 1).expand(-1, 3, -1, -1)
 
 
-def contact_sheet(columns: dict[str, Float[Tensor, "b 3 h w"]], path: Path) -> None:
-    """A row per example and a titled column per kind of picture, written as PNG."""
+def contact_sheet(
+    columns: dict[str, Float[Tensor, "b 3 h w"]], path: Path, captions: Sequence[str] = ()
+) -> None:
+    """A row per example and a titled column per kind of picture, written as PNG.
+
+    `captions`, one a row or none at all, stand above the rows and say what these show.
+    """
     titles = list(columns)
     pictures = [columns[title].detach().float().cpu().clamp(0, 1) for title in titles]
     rows, height, width = len(pictures[0]), *pictures[0].shape[-2:]
     scale = max(1, round(_LEAST_TILE_PIXELS / width))
     tile_height, tile_width = height * scale, width * scale
     strip, gap = 20, 4
-    sheet = np.full(
-        (strip + rows * (tile_height + gap), len(titles) * (tile_width + gap), 3), 255, np.uint8
-    )
+    above = 16 if captions else 0
+    pitch = above + tile_height + gap
+    sheet = np.full((strip + rows * pitch, len(titles) * (tile_width + gap), 3), 255, np.uint8)
     for column, picture in enumerate(pictures):
         pixels = (picture * 255).round().byte().permute(0, 2, 3, 1).numpy()
         for row, tile in enumerate(pixels.repeat(scale, 1).repeat(scale, 2)):
-            top, left = strip + row * (tile_height + gap), column * (tile_width + gap)
+            top, left = strip + row * pitch + above, column * (tile_width + gap)
             sheet[top : top + tile_height, left : left + tile_width] = tile
-    write_whole(path, _titled(sheet, titles, tile_width + gap))
+    texts = {(column * (tile_width + gap) + 4, 4): title for column, title in enumerate(titles)}
+    if captions:
+        said = zip(range(rows), captions, strict=True)
+        texts |= {(4, strip + row * pitch + 1): " ".join(text.split()) for row, text in said}
+    write_whole(path, _written_on(sheet, texts))
 
 
-def _titled(sheet: np.ndarray, titles: list[str], pitch: int) -> bytes:
+def _written_on(sheet: np.ndarray, texts: dict[tuple[int, int], str]) -> bytes:
+    """A PNG of the sheet with texts, by the (x, y) of their upper left corners."""
     picture = Image.fromarray(sheet)
     draw = ImageDraw.Draw(picture)
-    for column, title in enumerate(titles):
-        draw.text((column * pitch + 4, 4), title, fill=(0, 0, 0))
+    # matplotlib brings it along: Pillow's own font has no arrows, and few of the letters of names.
+    font = ImageFont.truetype(font_manager.findfont("DejaVu Sans"), _FONT_PIXELS)
+    for place, text in texts.items():
+        draw.text(place, text, fill=(0, 0, 0), font=font)
     content = io.BytesIO()
     picture.save(content, "png")
     return content.getvalue()

@@ -8,6 +8,7 @@ from orbits import capture, even, ring, textured_capture
 from PIL import Image
 from rich.console import Console
 
+from data_prep import report_pairs
 from data_prep.build import prepare
 from data_prep.report import coverage, write_report
 from data_prep.report_pairs import correction_facts, error_histogram, pair_sheet
@@ -61,6 +62,23 @@ def test_the_table_of_pairs_is_read_once_for_all_pictures(
     )
     pair_sheet(data, [0, 1, 2], tmp_path / "sheet.png")
     assert splits == ["train"]
+
+
+def test_the_rows_of_a_sheet_say_which_pairs_they_show(
+    data: PreparedData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    monkeypatch.setattr(
+        report_pairs, "contact_sheet", lambda columns, path, captions: said.extend(captions)
+    )
+    pair_sheet(data, [5, 2], tmp_path / "sheet.png")
+    pairs = data.pairs("train")
+    for number, (index, caption) in enumerate(zip([5, 2], said, strict=True), start=1):
+        names = data.names(pairs.sequence[index])
+        reference, query = names[pairs.reference[index]], names[pairs.query[index]]
+        angle = np.degrees(pairs.angle_rad[index])
+        where = pairs.sequence[index]
+        assert caption == f"{number}: {angle:.0f}°, {where}, {reference} → {query}"
 
 
 def test_its_pictures_are_there_and_not_blank(data: PreparedData) -> None:
