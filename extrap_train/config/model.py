@@ -1,8 +1,9 @@
 """The denoiser with its conditioning, and how views are sampled."""
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
-from extrap_train.config.tree import MISSING
+from extrap_train.config.tree import MISSING, require_one_of
 
 FAMILIES = ("zeronvs", "megascenes", "ours")
 """What a denoiser may be told about the query view; `extrap_train.diffusion.family` has each."""
@@ -84,11 +85,21 @@ class SamplerOptions:
     guidance_interval: list[float] | None = None
     guidance_rescale: float | None = None
     compat: str | None = None
+    without: list[str] = field(default_factory=list)
+    """What the model recommends and is not wanted: `guidance_far`, `compat`."""
 
     def over(self, recommended: SamplerConfig) -> SamplerConfig:
-        """The model's recommendation with what is said here put over it."""
+        """The model's recommendation with what is said here put over it.
+
+        Asked for another solver than DDIM, it leaves out what is recommended for DDIM alone.
+        """
+        for name in self.without:
+            require_one_of("sampler.without", name, ("guidance_far", "compat"))
         said = {name: value for name, value in vars(self).items() if value is not None}
-        return replace(recommended, **said)
+        left_out: dict[str, Any] = dict.fromkeys(said.pop("without"))
+        if said.get("solver", "ddim") != "ddim":
+            left_out |= {"eta": 0.0, "compat": None}
+        return replace(recommended, **(left_out | said))
 
 
 @dataclass

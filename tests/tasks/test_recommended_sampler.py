@@ -58,10 +58,31 @@ def test_the_command_line_says_what_it_wants_otherwise(
     assert sampler_for(config.sampler, config.model) == expected
 
 
-def test_a_second_order_solver_and_a_recommended_eta_say_what_to_do() -> None:
-    config = _composed("model=zeronvs", "sampler.solver=dpmpp")
+@pytest.mark.parametrize("solver", ["dpmpp", "unipc"])
+def test_a_second_order_solver_leaves_out_what_was_recommended_for_ddim(solver: str) -> None:
+    config = _composed(
+        "model=zeronvs", f"sampler.solver={solver}", "model.sampler.compat=megascenes"
+    )
+    expected = replace(_PUBLISHED, solver=solver, eta=0.0)
+    assert sampler_for(config.sampler, config.model) == expected
+
+
+@pytest.mark.parametrize("own", ["sampler.eta=0.5", "sampler.compat=megascenes"])
+def test_what_is_asked_for_beside_a_second_order_solver_says_what_to_do(own: str) -> None:
+    config = _composed("model=zeronvs", "sampler.solver=dpmpp", own)
     with pytest.raises(InputError, match=r"sampler\.eta=0"):
         sampler_for(config.sampler, config.model)
+
+
+def test_what_a_model_recommends_can_be_left_out() -> None:
+    recommended = ["model.sampler.guidance_far=5", "model.sampler.compat=megascenes"]
+    config = _composed("model=zeronvs", *recommended, "sampler.without=[guidance_far,compat]")
+    assert sampler_for(config.sampler, config.model) == _PUBLISHED
+    one = _composed("model=zeronvs", *recommended, "sampler.without=[compat]")
+    assert sampler_for(one.sampler, one.model) == replace(_PUBLISHED, guidance_far=5.0)
+    other = _composed("model=zeronvs", "sampler.without=[steps]")
+    with pytest.raises(InputError, match=r"sampler\.without=steps is unknown; known: guidance_far"):
+        sampler_for(other.sampler, other.model)
 
 
 def test_a_saved_model_remembers(folder: Path) -> None:
