@@ -1,6 +1,7 @@
 """Weights that somebody else trained: read without running any of the file, matched strictly."""
 
 import pickle
+import pickletools
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -58,9 +59,10 @@ class WeightFile:
                 mapped = zipfile.is_zipfile(self.path)
                 return torch.load(self.path, map_location="cpu", weights_only=True, mmap=mapped)
         except (pickle.UnpicklingError, TypeError) as error:
-            raise self.refusal(self._unsafe(error)) from None
+            is_unsafe = zipfile.is_zipfile(self.path) or "GLOBAL" in str(error)
+            raise self._unreadable(is_unsafe=is_unsafe) from None
         except (*_DAMAGE, SafetensorError):
-            raise self.refusal("is cut off, damaged, or no file of weights") from None
+            raise self._unreadable(is_unsafe=False) from None
 
     def tensors(self, content: object, *keys: str) -> dict[str, Tensor]:
         """The state dict in what `read` gave: under the first of `keys` that is there, or all."""
@@ -107,7 +109,17 @@ class WeightFile:
         """One line: file, reason, option, and what belongs there."""
         return InputError(f"{self.path}: {reason}; give {self.option}=FILE, {self.content}")
 
-    def _unsafe(self, error: Exception) -> str:
-        if not zipfile.is_zipfile(self.path) and "GLOBAL" not in str(error):
-            return "is cut off, damaged, or no file of weights"
-        return "holds more than tensors, which could run code, and is not read"
+    def _unreadable(self, *, is_unsafe: bool) -> InputError:
+        if is_unsafe or _is_pickle_of_objects(self.path):
+            return self.refusal("holds more than tensors, which could run code, and is not read")
+        return self.refusal("is cut off, damaged, or no file of weights")
+
+
+def _is_pickle_of_objects(path: Path) -> bool:
+    """Whether the file is a whole pickle that names a type or function; nothing of it is run."""
+    try:
+        with path.open("rb") as file:
+            names = {opcode.name for opcode, _, _ in pickletools.genops(file)}
+    except (ValueError, OSError, EOFError, UnicodeError):
+        return False
+    return not names.isdisjoint({"GLOBAL", "STACK_GLOBAL", "INST", "EXT1", "EXT2", "EXT4"})

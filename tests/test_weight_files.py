@@ -1,5 +1,6 @@
 import argparse
 import os
+import pickle
 import re
 from collections import OrderedDict
 from pathlib import Path
@@ -97,6 +98,16 @@ def test_code_does_not_run(tmp_path, zipped):
     path = tmp_path / "net.pth"
     torch.save(content, path, _use_new_zipfile_serialization=zipped)
     refused(weight_file(path), "could run code")
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+@pytest.mark.parametrize("name", ["net.pkl", "net.ckpt", "net.safetensors"])
+def test_a_plain_pickle_is_refused_as_one(tmp_path, protocol, name):
+    """Python's own, which torch takes for a damaged file."""
+    path = tmp_path / name
+    path.write_bytes(pickle.dumps({"model": Bomb(tmp_path / "ran")}, protocol))
+    refused(weight_file(path), "could run code, and is not read")
     assert not (tmp_path / "ran").exists()
 
 
