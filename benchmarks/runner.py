@@ -34,6 +34,7 @@ from extrap_train.errors import InputError
 from extrap_train.jobs import Died, Launcher
 from extrap_train.jobs.local import LocalLauncher
 from extrap_train.jobs.slurm import slurm_launcher
+from extrap_train.terminal import terminal
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ def run_table(table: TableConfig, catalogue: Catalogue, options: RunOptions) -> 
 
     Raises InputError where another run holds the folder, or where the table cannot be made.
     """
-    console = Console()
+    console = terminal()
     folder = TableFolder(Path(table.output) / table.name)
     _make_folder(folder)
     try:
@@ -112,7 +113,7 @@ def _run(
     results = read_results(folder)
     written = write_reports(results, catalogue, folder)
     for reason, names in problems.items():
-        console.print(f"[bold]{len(names)}[/] cells of {', '.join(sorted(set(names)))}: {reason}")
+        console.print(f"{len(names)} cells of {', '.join(sorted(set(names)))}: {reason}")
     for path in written:
         console.print(f"written: {path}")
     console.print(f"result: {folder.path}")

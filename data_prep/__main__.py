@@ -8,10 +8,9 @@ from extrap_train.config import DataPrepConfig
 
 def _run(config: DataPrepConfig) -> None:
     # Heavy imports wait until the options are known to be right.
-    from rich.console import Console
-
     from data_prep.report import write_report
     from extrap_train.tasks.prepare import check_members, prepare_category
+    from extrap_train.terminal import terminal
 
     check_members(config.category, config.data)
     for member in config.category.members:
@@ -26,7 +25,7 @@ def _run(config: DataPrepConfig) -> None:
             launcher=config.launcher,
             retry=True,
         )
-        write_report(prepared, Console())
+        write_report(prepared, terminal())
 
 
 def main() -> None:

@@ -23,6 +23,7 @@ _RANK = {
     "extrap_train.pictures": 4,
     "extrap_train.processes": 4,
     "extrap_train.diffusion": 5,
+    "extrap_train.terminal": 1,
     "extrap_train.trained_on": 4,
     "extrap_train.runs": 5,
     "extrap_train.sweep": 5,
@@ -87,3 +88,9 @@ def test_geometry_knows_neither_lightning_nor_hydra(library: str) -> None:
 def test_every_file_is_short() -> None:
     long = [str(p) for p in _FILES if len(p.read_text().splitlines()) > 350]
     assert not long
+
+
+def test_every_command_speaks_through_one_console() -> None:
+    """A console of its own would take brackets in a path for markup, and fold it."""
+    own = [str(p) for p in _FILES if p.name != "terminal.py" and "Console(" in p.read_text()]
+    assert not own

@@ -13,7 +13,6 @@ import lightning
 import torch
 from filelock import FileLock, Timeout
 from lightning.pytorch.loggers import TensorBoardLogger
-from rich.console import Console
 
 from extrap_train.config import TrainConfig, placed
 from extrap_train.data.module import PairModule
@@ -46,6 +45,7 @@ from extrap_train.runs import (
 from extrap_train.tasks.results import Finished, Results, draw_curve, draw_views, write_results
 from extrap_train.tasks.seen_before import require_unseen
 from extrap_train.tasks.training_data import data_module, prepared_data, validation_names
+from extrap_train.terminal import terminal
 from extrap_train.trained_on import TrainedOn
 
 
@@ -56,7 +56,7 @@ def run(config: TrainConfig) -> Path:
     good.
     """
     require_accelerator(config.trainer.accelerator)
-    console = Console(quiet=not is_first())
+    console = terminal(quiet=not is_first())
     quieten_lightning()
     distance, missing = lpips_or_reason(config.validation.lpips_weights)
     folder = run_folder(config)

@@ -52,6 +52,7 @@ from extrap_train.runs import newest_run
 from extrap_train.tasks.completed import Completed, write_completed
 from extrap_train.tasks.scene_folder import require_same, result_folder
 from extrap_train.tasks.scene_inputs import device_of, required_scene, trained_model
+from extrap_train.terminal import terminal
 from extrap_train.views import stack_cameras, stack_poses
 
 _NOT_PART_OF_THE_MAP = (
@@ -81,7 +82,7 @@ class _Job:
 def run(config: TrainConfig) -> Path:
     """Complete a scene; a second run resumes after the last whole view, or says that it is done."""
     job = _job(config)
-    console = Console()
+    console = terminal()
     job.folder.mkdir(parents=True, exist_ok=True)
     try:
         with FileLock(job.folder / ".lock", timeout=0):
@@ -122,7 +123,7 @@ def _check_category(config: TrainConfig, sequence: Sequence) -> None:
             f"scene {config.scene!r} is of category {own}, but category={chosen} would paint it "
             f"with its newest model: give category={own}, or name the model, weights=FOLDER or base"
         )
-    Console().print(f"the scene is of category {own}, not {chosen}")
+    terminal().print(f"the scene is of category {own}, not {chosen}")
 
 
 def _slug(sequence: Sequence) -> str:

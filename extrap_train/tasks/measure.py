@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import lightning
-from rich.console import Console
 
 from extrap_train.config import TrainConfig
 from extrap_train.data.store import PreparedData
@@ -20,6 +19,7 @@ from extrap_train.tasks.results import Results, write_results
 from extrap_train.tasks.saved_model import require_as_said
 from extrap_train.tasks.seen_before import require_unseen
 from extrap_train.tasks.training_data import data_module, prepared_data, validation_names
+from extrap_train.terminal import terminal
 from extrap_train.trained_on import TrainedOn
 
 
@@ -66,7 +66,7 @@ def measure(
         parameters=sum(p.numel() for p in model.parameters()),
         provenance=provenance(config, {d.folder.name: d.manifest["key"] for d in data.prepared}),
     )
-    write_results(results, config, folder, Console())
+    write_results(results, config, folder, terminal())
 
 
 def _validator(config: TrainConfig) -> lightning.Trainer:

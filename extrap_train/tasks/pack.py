@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import torch
-from rich.console import Console
 
 from extrap_train.config import TrainConfig
 from extrap_train.diffusion.checkpoint import load_model, save_compact
@@ -11,13 +10,14 @@ from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.packaged import packaged_name, packaged_weights
 from extrap_train.runs import existing_run
 from extrap_train.tasks.scene_inputs import model_of
+from extrap_train.terminal import terminal
 
 _BASE = "base"
 
 
 def run(config: TrainConfig) -> None:
     """Write the newest (or `weights`) model under the name that the package gives it."""
-    console = Console()
+    console = terminal()
     model = model_of(config, config.weights or str(existing_run(config).model))
     name = packaged_name(model.config.family, config.category.name)
     folder = Path(config.output) / "packed" / name

@@ -44,6 +44,7 @@ from extrap_train.tasks.scene_inputs import (
     required_scene,
     trained_model,
 )
+from extrap_train.terminal import terminal
 from extrap_train.views import View, stack_cameras
 
 
@@ -53,7 +54,7 @@ def run(config: TrainConfig) -> Path:
     What the input views leave over of the scene is held out: the model is measured there with and
     without the adapter. Adapter and numbers appear together, or, interrupted, not at all.
     """
-    console = Console()
+    console = terminal()
     if config.adapter is not None:
         raise InputError("task=scene makes an adapter and takes none: leave adapter= out")
     if config.trainer.compile:

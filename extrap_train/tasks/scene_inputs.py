@@ -5,7 +5,6 @@ from pathlib import Path
 
 import torch
 from lightning.fabric import Fabric
-from rich.console import Console
 
 from data_prep.views import choose_frames, input_views
 from extrap_train.config import ModelConfig, SyntheticConfig, TrainConfig, sampler_for
@@ -24,6 +23,7 @@ from extrap_train.diffusion.packaged import packaged_name, packaged_names, packa
 from extrap_train.errors import InputError
 from extrap_train.runs import newest_run
 from extrap_train.tasks.saved_model import require_as_said, require_described
+from extrap_train.terminal import terminal
 from extrap_train.views import Camera, View
 
 
@@ -101,7 +101,7 @@ def trained_model(config: TrainConfig) -> ExtrapolationModel:
         return model_of(config, config.weights)
     name, newest = named_weights(config), newest_run(config).model
     if not newest.is_dir():
-        Console(stderr=True).print(f"{newest}: there is none yet; weights={name}, of the package")
+        terminal(stderr=True).print(f"{newest}: there is none yet; weights={name}, of the package")
     return model_of(config, name)
 
 
@@ -125,7 +125,7 @@ def adapter_origin(config: TrainConfig) -> AdapterOrigin | None:
 def _say_whose(config: TrainConfig) -> None:
     origin, here = adapter_origin(config), scene_address(required_scene(config))
     if origin is not None and origin.scene != here:
-        Console(stderr=True, soft_wrap=True).print(
+        terminal(stderr=True).print(
             f"adapter={config.adapter}: was made for {origin.scene}, not for {here}, which the "
             "model alone may paint better"
         )

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from rich.console import Console
 
 from data_prep.frames import object_square
 from data_prep.views import choose_frames, input_views
@@ -45,6 +44,7 @@ from extrap_train.tasks.scene_inputs import (
     painter,
     trained_model,
 )
+from extrap_train.terminal import terminal
 from extrap_train.views import Camera, View, stack_cameras
 
 _UNSEEN_SHARE = 0.02
@@ -67,7 +67,7 @@ def run(config: TrainConfig) -> None:
 
     They take the place of what was asked of the same scene, inputs and weights before.
     """
-    console = Console()
+    console = terminal()
     sequence = open_sequence(config)
     query = _query(config, sequence)
     folder, options = result_folder(config, label_of(sequence)), scene_options(config)
@@ -97,7 +97,7 @@ def _say_shares(made: GeneratedViews, names: list[str], console: Console) -> Non
     unseen = [name for name, share in zip(names, shares, strict=True) if share < _UNSEEN_SHARE]
     if unseen:
         more = f" and {len(unseen) - 1} more" if len(unseen) > 1 else ""
-        Console(stderr=True, soft_wrap=True).print(
+        terminal(stderr=True).print(
             f"the inputs show next to nothing of {unseen[0]}{more}, which is made up: does its "
             "camera look at the scene, from near enough? A pose file has OpenGL's axes (+X right, "
             "+Y up, −Z forward) and the scene's unit"
