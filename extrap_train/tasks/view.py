@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from rich.console import Console
 
 from data_prep.frames import object_square
 from data_prep.views import choose_frames, input_views
