@@ -67,10 +67,15 @@ def test_the_photograph_that_is_asked_for_is_no_input(
 
 
 def test_the_same_in_three_lines_of_python(weights) -> None:
-    generator = open_generator(str(weights))
+    generator = open_generator(str(weights), device="cpu", precision="32-true")
     views = open_views("synthetic:cup/0001", generator, inputs=3)
     images = generator.generate(views, *walk(views, degrees=90.0, frames=2)).images
     assert images.shape == (2, 3, 16, 16)
+    lower = open_generator(str(weights), device="cpu")
+    assert lower.precision == "bf16-mixed"
+    again = lower.generate(views, *walk(views, degrees=90.0, frames=2)).images
+    assert again.dtype == images.dtype
+    assert 0 < (again - images).abs().max() < 0.1
 
 
 def _poses(path: Path, translation: float, *names: str) -> Path:
