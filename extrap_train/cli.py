@@ -2,13 +2,10 @@
 is wrong.
 """
 
-import difflib
 import errno
 import os
-import re
 import sys
 from collections.abc import Callable
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from extrap_train import config as schema
 from extrap_train.errors import InputError
+from extrap_train.option_errors import options_of
 from extrap_train.tasks import TASKS
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
@@ -48,6 +46,12 @@ _GROUPS: dict[str, list[type]] = {
     "launcher": [schema.LocalConfig, schema.SlurmConfig],
     "model": [schema.ModelConfig],
 }
+
+_COMMANDS: dict[str, tuple[type, dict[str, list[type]], tuple[str, ...]]] = {
+    "train": (schema.TrainConfig, _GROUPS, ("experiment", "sweep")),
+    "prep": (schema.DataPrepConfig, _GROUPS, ()),
+}
+"""Tree, groups that it may have, and further choices of each command, by its file's name."""
 
 
 def register_schemas() -> None:
@@ -97,7 +101,8 @@ def command(name: str, run: Callable[[Any], Path | None]) -> None:
     except InputError as error:
         sys.exit(f"error: {error}")
     except (HydraException, OmegaConfBaseException) as error:
-        sys.exit(f"error: {_one_line(error, _overrides(sys.argv[1:]))}")
+        options = options_of(*_COMMANDS[name])
+        sys.exit(f"error: {options.one_line(error, _overrides(sys.argv[1:]))}")
     except KeyboardInterrupt as stopped:
         sys.exit(f"interrupted: {str(stopped) or 'run the same command again to resume'}")
 
@@ -155,41 +160,6 @@ def _complete_help(words: list[str]) -> None:
 def _overrides(arguments: list[str]) -> list[str]:
     """What is no flag of Hydra's, nor looks like the value of one."""
     return [w for w in arguments if not w.startswith("-") and ("=" in w or w.startswith("~"))]
-
-
-def _one_line(error: Exception, overrides: list[str]) -> str:
-    text = " ".join(f"{error} {error.__cause__ or ''}".split())
-    group = re.search(
-        r"Could not find '(\w+)/([^']+)' Available options in '\w+': (.*?)(?= Config)", text
-    )
-    if group:
-        kind, value, known = group.groups()
-        names = [n for n in known.split() if not n.endswith("_schema")]
-        return f"{kind}={value} is unknown{_suggest(value, names)}; known: {', '.join(names)}"
-    required = re.search(r"You must specify '(\w+)'.*?Available options:(.*)", text)
-    if required:
-        names = [n for n in required[2].split() if not n.endswith("_schema")]
-        return f"{required[1]} is not given: {required[1]}={'|'.join(names)}"
-    unknown = re.search(r"Key '(\w+)' (?:is )?not in", text) or re.search(
-        r"Could not override '([\w.]+)'", text
-    )
-    if unknown:
-        keys = [o.partition("=")[0].lstrip("+~") for o in overrides]
-        given = next((key for key in keys if key.endswith(unknown[1])), unknown[1])
-        return f"there is no option {given}{_suggest(given, _known_options())}; see --help"
-    return text
-
-
-def _known_options() -> list[str]:
-    tree: Any = OmegaConf.to_container(OmegaConf.structured(schema.TrainConfig))
-    variants = [(group, variant) for group, all_ in _GROUPS.items() for variant in all_]
-    names = [f"{group}.{field.name}" for group, variant in variants for field in fields(variant)]
-    return [*schema.dotted(tree), *names, *_GROUPS]
-
-
-def _suggest(given: str, known: list[str]) -> str:
-    near = difflib.get_close_matches(given, known, n=1, cutoff=0.5)
-    return f"; did you mean {near[0]}?" if near else ""
 
 
 def _use_threads(threads: int | None) -> None:

@@ -39,7 +39,10 @@ def _error(arguments: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
         (["category=hydrant", "experiment=smalbase"], "experiment=smalbase is unknown"),
         (["category=hydrant", "trainer.stesp=3"], "did you mean trainer.steps"),
         (["category=hydrant", "mdoel=small"], "did you mean model"),
-        (["category=hydrant", "trainer.steps=abc"], "'abc' of type 'str' could not be converted"),
+        (["catgory=hydrant"], "no option catgory, did you mean category?"),
+        (["category=hydrant", "experimnt=paper"], "no option experimnt; did you mean experiment?"),
+        (["category=hydrant", "depth.planes=8"], "depth.planes is an option of depth=stereo: give"),
+        (["category=hydrant", "data.set_list=dev"], "data.set_list is an option of data=co3d:"),
         (["category=hydrant", "trainer.steps=0"], "trainer.steps=0: must be at least 1"),
         (["category=hydrant", "threads=0"], "threads=0: must be at least 1"),
         (["category=hydrant", "seed=-1"], "seed=-1: must be from 0"),
@@ -81,6 +84,42 @@ def test_a_wrong_option_is_one_clear_line(
     arguments: list[str], said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     assert said in _error(arguments, monkeypatch, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("trainer.steps=abc", "must be a whole number"),
+        ("trainer.steps=1e3", "must be a whole number"),
+        ("trainer.steps=null", "cannot be null"),
+        ("model.learning_rate=fast", "must be a number"),
+        ("resume=maybe", "must be true or false"),
+        ("model.unet.channels=[a]", "must be a whole number"),
+        ("model.unet.channels=3", "must be a list, as [1,2]"),
+        ("trainer=3", "has options of its own: give those, as trainer.NAME=VALUE"),
+    ],
+)
+def test_a_value_of_another_type_is_said_as_it_was_given(
+    word: str, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    assert _error(["category=hydrant", word], monkeypatch, tmp_path) == f"error: {word}: {said}"
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("trainer.steps=10", "there is no option trainer.steps; see --help"),
+        ("prep.image_sise=64", "did you mean prep.image_size?"),
+        ("depth.planes=8", "is an option of depth=stereo"),
+    ],
+)
+def test_a_command_suggests_only_what_it_has(
+    word: str, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    options = ["category=hydrant", word, f"output={tmp_path / 'out'}"]
+    monkeypatch.setattr(sys, "argv", ["data_prep", *options])
+    with pytest.raises(SystemExit, match=re.escape(said)):
+        prepare()
 
 
 def test_a_missing_root_is_named_and_hydra_adds_no_line(
