@@ -31,8 +31,10 @@ _OPTIONS = [
 ]
 
 
-def _start(output: Path, *more: str) -> "subprocess.Popen[bytes]":
-    command = [sys.executable, "-m", "extrap_train", *_OPTIONS, f"output={output}", *more]
+def _start(
+    output: Path, *more: str, program: tuple[str, str] = ("-m", "extrap_train")
+) -> "subprocess.Popen[bytes]":
+    command = [sys.executable, *program, *_OPTIONS, f"output={output}", *more]
     environment = os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     with (output / "log.txt").open("wb") as log:
         return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
@@ -149,27 +151,62 @@ def test_views_denoised_together_are_measured_as_the_same_views(
     assert {k: v.shape for k, v in unets[0].items()} == {k: v.shape for k, v in unets[1].items()}
 
 
-def test_killed_at_any_moment_the_weights_are_the_same(undisturbed: Path, tmp_path: Path) -> None:
-    """SIGKILL during preparation, between checkpoints and right after the last; then run to the
-    end.
+_KILLED_WITHIN = """
+import os, signal, sys
+from extrap_train.__main__ import main
+from {module} import {owner} as owner
+
+def killed(*arguments, **options):
+    if "{where}" in str(arguments):
+        if "{name}" == "save":
+            open(arguments[1], "wb").write(b"half")
+        os.kill(os.getpid(), signal.SIGKILL)
+    return really(*arguments, **options)
+
+really, owner.{name} = owner.{name}, killed
+main()
+"""
+"""A job that kills itself where a function is called, of a file half-written if it saves one."""
+
+
+def _kill_at_file(output: Path, pattern: str) -> None:
+    """Start the job and kill it once such a file is there."""
+    process = _start(output)
+    while process.poll() is None and not any(output.glob(pattern)):
+        time.sleep(0.02)
+    assert process.poll() is None, _said(output)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+
+
+def _kill_within(output: Path, module: str, owner: str, name: str, where: str) -> None:
+    """Start a job that kills itself within `module.owner.name(…)`, of whose arguments one says
+    `where`.
     """
-    checkpoints = tmp_path / "train/hydrant/small"
-    moments = [
-        lambda: any(tmp_path.glob("synthetic/hydrant/0000/**/*.jpg")),
-        lambda: any(checkpoints.glob("*/checkpoints/step-00000003.ckpt")),
-        lambda: any(checkpoints.glob("*/checkpoints/step-00000006.ckpt")),
-    ]
-    for reached in moments:
-        process = _start(tmp_path)
-        while process.poll() is None and not reached():
-            time.sleep(0.02)
-        assert process.poll() is None, _said(tmp_path)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
+    script = _KILLED_WITHIN.format(module=module, owner=owner, name=name, where=where)
+    process = _start(output, program=("-c", script))
+    process.wait(timeout=300)
+    assert process.returncode == -signal.SIGKILL, _said(output)
+
+
+def test_killed_again_and_again_the_weights_are_the_same(undisturbed: Path, tmp_path: Path) -> None:
+    """SIGKILL while sequences are rendered, within the writing of a checkpoint, within the
+    validation behind it, and right after the last one; then run to the end.
+    """
+    _kill_at_file(tmp_path, "synthetic/hydrant/0000/**/*.jpg")
+    _kill_within(tmp_path, "extrap_train.diffusion.callbacks", "torch", "save", "step-00000006")
+    kept = [path.name for path in (_run_folder(tmp_path) / "checkpoints").glob("step-*")]
+    assert kept == ["step-00000003.ckpt"], "killed within the writing of the second"
+    _kill_within(tmp_path, "extrap_train.diffusion", "evaluation", "sample_views", "")
+    assert not (_run_folder(tmp_path) / "metrics.csv").read_text().count("validation/")
+    _kill_at_file(tmp_path, "train/hydrant/small/*/checkpoints/step-00000012.ckpt")
     _finish(tmp_path)
     assert _weights(tmp_path) == _weights(undisturbed)
-    one, other = (pd.read_csv(_run_folder(o) / "metrics.csv") for o in (undisturbed, tmp_path))
-    pd.testing.assert_frame_equal(one, other)
+    pd.testing.assert_frame_equal(_metrics(undisturbed), _metrics(tmp_path))
+
+
+def _metrics(output: Path) -> pd.DataFrame:
+    return pd.read_csv(_run_folder(output) / "metrics.csv")
 
 
 def test_a_run_killed_behind_its_last_step_still_ends(undisturbed: Path, tmp_path: Path) -> None:
