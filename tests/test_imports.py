@@ -3,6 +3,10 @@ diffusion.
 """
 
 import ast
+import re
+import sys
+import tomllib
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
@@ -84,6 +88,25 @@ def test_geometry_knows_neither_lightning_nor_hydra(library: str) -> None:
     for path in _FILES:
         if _module(path).startswith("extrap_train.geometry"):
             assert not any(name.split(".")[0] == library for name in _imports(path)), path
+
+
+def test_what_is_imported_is_declared() -> None:
+    """Whatever another package happens to bring along is not ours to rely on."""
+    project = tomllib.loads((_ROOT / "pyproject.toml").read_text())["project"]
+    declared = {
+        re.split(r"[^\w.-]", line)[0].lower()
+        for lines in (project["dependencies"], *project["optional-dependencies"].values())
+        for line in lines
+    }
+    imported = {name.split(".")[0] for path in _FILES for name in _imports(path)}
+    ours = {"extrap_train", "data_prep", "benchmarks", "conf"}
+    distributions = packages_distributions()
+    undeclared = {
+        name
+        for name in imported - ours - set(sys.stdlib_module_names)
+        if not declared & {d.lower() for d in distributions.get(name, [name])}
+    }
+    assert not undeclared
 
 
 def test_every_file_is_short() -> None:

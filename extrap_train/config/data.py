@@ -65,9 +65,9 @@ class PrepConfig:
     min_coverage_deg: float = 300.0
     """Least azimuth covered around the fitted orbit axis."""
     min_viewpoint_quality: float = 0.0
-    """CO3D's own score of a frame's camera, where it has one."""
+    """CO3D's own score of a sequence's cameras, where it has one."""
     min_point_cloud_quality: float = -2.0
-    """CO3D's own score of a sequence's cloud, where it has one."""
+    """CO3D's own score of a sequence's point cloud, where it has one."""
     max_uses: int = 16
     """Most pairs that one frame takes part in."""
     min_pair_angle_deg: float = 8.0
