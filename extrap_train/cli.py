@@ -6,6 +6,7 @@ import errno
 import os
 import sys
 from collections.abc import Callable
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,8 @@ _COMMANDS: dict[str, tuple[type, dict[str, list[type]], tuple[str, ...]]] = {
 
 
 def register_schemas() -> None:
-    """Make the dataclasses known to Hydra, as `<name>_schema`."""
+    """Make the dataclasses known to Hydra, as `<name>_schema`, and choices to its help."""
+    OmegaConf.register_new_resolver("choices", _choices, replace=True)
     store = ConfigStore.instance()
     store.store(name="train_schema", node=schema.TrainConfig)
     store.store(name="prep_schema", node=schema.DataPrepConfig)
@@ -63,6 +65,25 @@ def register_schemas() -> None:
         for variant in variants:
             name = variant.name if len(variants) > 1 else group  # type: ignore[attr-defined]
             store.store(group=group, name=f"{name}_schema", node=variant)
+
+
+def _choices(*groups: str, _root_: Any) -> str:
+    """What may be chosen of each group, a line each; folders of one's own (`--config-dir`) count.
+
+    Hydra's own list has the schemas, too, which are no choices, and every group that there is.
+    """
+    sources = [s for s in _root_.hydra.runtime.config_sources if s.schema in ("pkg", "file")]
+    folders = [files(s.path) if s.schema == "pkg" else Path(s.path) for s in sources]
+    lines = []
+    for group in groups:
+        places = [Path(str(folder)) / group for folder in folders]
+        names = {
+            file.relative_to(place).with_suffix("").as_posix()
+            for place in places
+            for file in place.rglob("*.yaml")
+        }
+        lines.append(f"{group}: {', '.join(sorted(names))}")
+    return "\n".join(lines)
 
 
 def command(name: str, run: Callable[[Any], Path | None]) -> None:

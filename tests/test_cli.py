@@ -280,6 +280,25 @@ def test_help_takes_options_before_it(
     assert "steps: 77" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("command", [main, prepare])
+def test_help_lists_what_the_command_can_be_given(
+    command: Callable[[], None],
+    own_choices: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["it", "--config-dir", str(own_choices), "--help"])
+    with pytest.raises(SystemExit):
+        command()
+    choices = capsys.readouterr().out.partition("Options and")[0].splitlines()
+    assert "category: all, apple, book, chair, cup, hydrant, mine, teddybear" in choices
+    assert "depth: dataset, mast3r, monocular, stereo" in choices
+    groups = {line.partition(":")[0] for line in choices if ": " in line and "=" not in line}
+    both = {"category", "data", "depth", "matcher"}
+    assert groups == both | ({"model", "experiment", "sweep"} if command is main else {"launcher"})
+    assert not any("schema" in line for line in choices)
+
+
 @pytest.mark.parametrize("place", ["file", "/proc/nowhere"])
 def test_an_output_that_can_be_no_folder_is_one_line(
     place: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
