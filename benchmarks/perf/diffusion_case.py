@@ -14,6 +14,8 @@ from torch.utils.flop_counter import FlopCounterMode
 from benchmarks.perf.warp import ANGLES_DEG, QUERY_ANGLE_DEG, orbit_camera
 from extrap_train.config import ClipConfig, ModelConfig, UNetConfig, VaeConfig
 from extrap_train.data.module import with_warp
+from extrap_train.diffusion.frozen import Frozen
+from extrap_train.diffusion.layout import arranged
 from extrap_train.diffusion.memory import LiveBytes
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.views import PairBatch, stack_cameras
@@ -64,16 +66,21 @@ def configuration(size: Size) -> ModelConfig:
 
 
 def optimised(config: ModelConfig, device: torch.device) -> ExtrapolationModel:
-    """The model with random weights, none of them zero, as training and sampling arrange it."""
+    """The model with random weights, none of them zero, as tasks arrange it to train and paint."""
     torch.manual_seed(0)
     model = ExtrapolationModel(config).to(device)
     torch.nn.init.normal_(model.unet.conv_out.weight, std=0.02)
-    return model.to(memory_format=torch.channels_last)
+    return arranged(model)
 
 
 def plain(model: ExtrapolationModel) -> ExtrapolationModel:
     """The same network without optimisations: attention as three products, contiguous layout."""
-    copied = copy.deepcopy(model).to(memory_format=torch.contiguous_format)
+    copied = copy.deepcopy(model)
+    for frozen in (copied.autoencoder, copied.image_encoder):
+        if isinstance(frozen, Frozen):  # copies of a model share them
+            frozen.network = copy.deepcopy(frozen.network)
+    for network in copied.parts().values():
+        network.to(memory_format=torch.contiguous_format)
     copied.unet.set_attn_processor(AttnProcessor())
     return copied
 

@@ -33,7 +33,11 @@ Sampling = Callable[[], Float[Tensor, "b 3 h w"]]
 
 
 def run() -> list[Row]:
-    """A row a device and batch size, on a GPU also with torch.compile; prints speed and memory."""
+    """A row a device and batch size; prints speed and memory.
+
+    On a GPU also with torch.compile, which the validations of a training with trainer.compile=true
+    sample with, and no other task.
+    """
     return [
         _compare(device, size, count, compiled)
         for device, size, counts in devices()
@@ -62,7 +66,7 @@ def _compare(device: torch.device, size: Size, count: int, compiled: bool) -> Ro
 
 
 def sampling(model: ExtrapolationModel, batch: PairBatch, steps: int) -> Sampling:
-    """The product's sampler under mixed precision, as validation runs it."""
+    """The product's sampler in mixed precision, the default of every task that paints."""
     options = SamplerConfig(steps=steps, guidance=_GUIDANCE)
     device = batch.image.device
 

@@ -28,6 +28,7 @@ from extrap_train.diffusion.callbacks import (
     checkpoints,
 )
 from extrap_train.diffusion.checkpoint import initial_model, save_model
+from extrap_train.diffusion.layout import arranged
 from extrap_train.diffusion.memory import GIB, advice_where_memory_ends, training_memory
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.training import CategoryTraining
@@ -154,9 +155,7 @@ def quieten_lightning() -> None:
 
 def _model(config: TrainConfig) -> ExtrapolationModel:
     torch.manual_seed(config.seed)
-    model = initial_model(placed(config.model))  # which says for good what it started from
-    for network in model.parts().values():
-        network.to(memory_format=torch.channels_last)
+    model = arranged(initial_model(placed(config.model)))  # says for good what it started from
     if config.trainer.gradient_checkpointing:
         model.unet.enable_gradient_checkpointing()
     if config.trainer.compile:

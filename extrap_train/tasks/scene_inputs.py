@@ -16,6 +16,7 @@ from extrap_train.device import require_accelerator
 from extrap_train.diffusion.adapter_card import AdapterOrigin
 from extrap_train.diffusion.checkpoint import is_own, load_model, published_model, saved_config
 from extrap_train.diffusion.generator import DiffusionGenerator, GeneratedViews
+from extrap_train.diffusion.layout import arranged
 from extrap_train.diffusion.lora import load_adapter, saved_origin
 from extrap_train.diffusion.memory import advice_where_painting_ends
 from extrap_train.diffusion.model import ExtrapolationModel
@@ -177,7 +178,7 @@ def open_model(
         )
     if adapter is not None:
         load_adapter(model, Path(adapter))
-    return model.eval()
+    return arranged(model).eval()
 
 
 def _folder_of(weights: str) -> Path:

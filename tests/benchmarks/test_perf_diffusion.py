@@ -1,7 +1,12 @@
 """What is timed against each other computes the same, but for precision."""
 
+import copy
+from typing import Any
+
 import pytest
 import torch
+from diffusers.models.attention_processor import Attention
+from torch import nn
 
 from benchmarks.perf.diffusion_case import (
     Size,
@@ -35,9 +40,20 @@ def batch() -> PairBatch:
     return batch_of(1, _CPU)
 
 
+def test_the_timed_model_is_arranged_and_the_plain_one_is_not(model: ExtrapolationModel) -> None:
+    """The frozen networks, too, which copies of a model share."""
+    copied = plain(model)
+    for part, name in (("unet", "conv_in"), ("vae", "encoder.conv_in")):
+        weights = [m.parts()[part].get_submodule(name).weight for m in (model, copied)]
+        last = [x.is_contiguous(memory_format=torch.channels_last) for x in weights]
+        assert last == [True, False]
+        assert torch.equal(*weights)
+
+
 def test_both_steps_have_one_loss(model: ExtrapolationModel, batch: PairBatch) -> None:
+    """Each as it is timed: fused, in mixed precision and channels last, against plain float32."""
     theirs = training_step(plain(model), batch, optimised=False)()
-    ours = training_step(plain(model), batch, optimised=True)()
+    ours = training_step(copy.deepcopy(model), batch, optimised=True)()
     torch.testing.assert_close(ours, theirs, atol=0.02, rtol=0.02)
 
 
@@ -48,7 +64,30 @@ def test_both_samplers_paint_one_picture(model: ExtrapolationModel, batch: PairB
 
 
 def test_operations_are_those_of_the_layers(config: ModelConfig) -> None:
-    """The first layer alone: 3 × 3 products of every input with every output channel, twice."""
-    channels = ExtrapolationModel(config).unet.config["in_channels"]
-    first = 2 * 9 * channels * 32 * 32 * 32
-    assert forward_flops(config) > 20 * first
+    """Every convolution, matrix and attention by its own formula; a product and a sum are two."""
+    with torch.device("meta"):
+        unet = ExtrapolationModel(config).unet
+    counted: list[int] = []
+
+    def convolution(layer: nn.Conv2d, _: Any, __: Any, out: torch.Tensor) -> None:
+        counted.append(2 * layer.weight[0].numel() * out.numel())
+
+    def matrix(layer: nn.Linear, _: Any, __: Any, out: torch.Tensor) -> None:
+        counted.append(2 * layer.in_features * out.numel())
+
+    def attention(layer: Attention, given: Any, named: Any, _: Any) -> None:
+        token = named.get("encoder_hidden_states")
+        asked = given[0].shape[1]
+        known = asked if token is None else token.shape[1]
+        counted.append(2 * 2 * asked * known * layer.inner_dim)
+
+    kinds: dict[type, Any] = {nn.Conv2d: convolution, nn.Linear: matrix, Attention: attention}
+    for layer in unet.modules():
+        if type(layer) in kinds:
+            layer.register_forward_hook(kinds[type(layer)], with_kwargs=True)
+    size, width = unet.config["sample_size"], config.unet.token_width
+    noisy = torch.empty(1, unet.config["in_channels"], size, size, device="meta")
+    step = torch.zeros(1, dtype=torch.long, device="meta")
+    unet(noisy, step, torch.empty(1, 1, width, device="meta"))
+    assert len(counted) > 100
+    assert forward_flops(config) == sum(counted)

@@ -1,0 +1,35 @@
+"""Every task paints with a model that is arranged for its convolutions, and paints the same."""
+
+import torch
+
+from extrap_train.config import ModelConfig, SamplerConfig
+from extrap_train.diffusion.checkpoint import load_model
+from extrap_train.diffusion.layout import arranged
+from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.packaged import packaged_weights
+from extrap_train.diffusion.sampler import sample_views, view_generator
+from extrap_train.tasks.view import open_generator
+from extrap_train.views import PairBatch
+
+
+def _is_arranged(model: ExtrapolationModel) -> bool:
+    return model.unet.conv_in.weight.is_contiguous(memory_format=torch.channels_last)
+
+
+def test_a_generator_s_model_is_arranged() -> None:
+    assert not _is_arranged(load_model(packaged_weights("base")))
+    assert _is_arranged(open_generator("base").model)
+
+
+def test_it_paints_the_same(config: ModelConfig, batch: PairBatch) -> None:
+    torch.manual_seed(0)
+    model = ExtrapolationModel(config).eval()
+    torch.nn.init.normal_(model.unet.conv_out.weight, std=0.05)
+
+    def painted() -> torch.Tensor:
+        generators = [view_generator(0, name) for name in "abc"]
+        return sample_views(model, batch, SamplerConfig(steps=3), generators)
+
+    before = painted()
+    assert arranged(model) is model
+    torch.testing.assert_close(painted(), before, atol=1e-4, rtol=0)
