@@ -36,11 +36,11 @@ class RunData:
     def of(cls, trained: RunFolder, config: TrainConfig) -> "RunData":
         """InputError where the options and what lies there today are not what it was trained on."""
         started = time.perf_counter()
-        saved = saved_config(trained.model)
-        require_as_said(saved, config.model, trained.model)
         prepared = prepared_data(config)
         today = TrainedOn.of(config.category.members, prepared)
         today.require_same(trained.data, "measure another run=NAME, or train one anew")
+        saved = saved_config(trained.model)
+        require_as_said(saved, config.model, trained.model)
         require_unseen(saved.start, today)
         return cls(prepared, time.perf_counter() - started)
 
