@@ -64,8 +64,8 @@ class _Plan:
             capture_keys.append(keys.frames_key(depth, size))
             qualities = [sequence.viewpoint_quality, sequence.point_cloud_quality]
             traits = [sequence.category, sequence.name, qualities, keys.content, keys.sizes]
-            traits += [len(sequence.left_out)] if sequence.left_out else []
-            digest.update(json.dumps(traits).encode())
+            lost = [len(sequence.left_out)] if sequence.left_out else []
+            digest.update(json.dumps([*traits, *lost]).encode())
         return cls(sequences, capture_keys, shop, test_names, digest.hexdigest())
 
     @property

@@ -99,8 +99,8 @@ def _posed_by_sequence(root: Path, file: Path) -> dict[str, _Posed]:
     if not posed:
         raise InputError(f"{file}: no frame has a camera; choose another category")
     if not sound:
-        count = f"none of the {len(degenerate)} frames of {file.parent.name} can be used"
-        raise InputError(f"{count}, the first because of {degenerate[0]}")
+        which = f"none of the {len(degenerate)} frames of {file.parent.name} can be used"
+        raise InputError(f"{which}, the first because of {degenerate[0]}")
     if degenerate:
         log.warning("%d frames are left out, the first: %s", len(degenerate), degenerate[0])
     return posed
