@@ -2,6 +2,7 @@
 
 import json
 import time
+from collections.abc import Collection
 from collections.abc import Sequence as List
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -35,6 +36,7 @@ from extrap_train.reconstruction.report import (
     view_consistency,
 )
 from extrap_train.runs import provenance
+from extrap_train.tasks.scene_inputs import learnt_frames
 from extrap_train.tasks.splats import write_fitted_splats
 from extrap_train.views import Camera, stack_cameras
 
@@ -150,7 +152,8 @@ def _compare_held_out(
 ) -> tuple[dict[str, float | None] | None, dict[str, str]]:
     """Views generated at the poses of photographs that were no inputs, against these."""
     given = done.known.views[: _count(done.known, GIVEN)]
-    frames = _held_out(given, done.unit, sequence)[: config.complete.held_out]
+    known = {view.view.name for view in given} | set(learnt_frames(config))
+    frames = _held_out(given, done.unit, sequence, known)[: config.complete.held_out]
     if not frames or config.complete.generator == "exact":
         return None, {}
     size = workshop.generator.image_size
@@ -195,15 +198,16 @@ def _compare_held_out(
     return scores, {}
 
 
-def _held_out(given: List[MapView], unit: WorldUnit, sequence: Sequence) -> list[Frame]:
-    """The frames that are no inputs and were not taken from where an input was."""
-    names = {view.view.name for view in given}
+def _held_out(
+    given: List[MapView], unit: WorldUnit, sequence: Sequence, known: Collection[str]
+) -> list[Frame]:
+    """The frames that are not known, and were not taken from where an input was."""
     inputs = stack_cameras([unit.outside(view.camera) for view in given])
     center = unit.center.double().numpy()
     return [
         frame
         for frame in sequence.frames
-        if frame.name not in names and not stand_where(frame.camera, inputs, center).any()
+        if frame.name not in known and not stand_where(frame.camera, inputs, center).any()
     ]
 
 

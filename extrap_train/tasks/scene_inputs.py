@@ -118,13 +118,20 @@ def model_of(config: TrainConfig, weights: str) -> ExtrapolationModel:
     return open_model(weights, config.adapter)
 
 
-def adapter_origin(config: TrainConfig) -> AdapterOrigin | None:
-    """What the adapter was made from, if there is one and it says so."""
+def learnt_frames(config: TrainConfig) -> list[str]:
+    """The scene's frames that the adapter was trained on, if there is one and it says so."""
+    origin = _origin(config)
+    if origin is None or origin.scene != scene_address(required_scene(config)):
+        return []
+    return origin.inputs
+
+
+def _origin(config: TrainConfig) -> AdapterOrigin | None:
     return None if config.adapter is None else saved_origin(Path(config.adapter))
 
 
 def _say_whose(config: TrainConfig) -> None:
-    origin, here = adapter_origin(config), scene_address(required_scene(config))
+    origin, here = _origin(config), scene_address(required_scene(config))
     if origin is not None and origin.scene != here:
         terminal(stderr=True).print(
             f"adapter={config.adapter}: was made for {origin.scene}, not for {here}, which the "

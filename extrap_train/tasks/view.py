@@ -22,7 +22,7 @@ from extrap_train.config import (
     TrainerConfig,
 )
 from extrap_train.data.posed import read_cameras
-from extrap_train.data.scene import open_scene, scene_address
+from extrap_train.data.scene import open_scene
 from extrap_train.data.sequences import Sequence
 from extrap_train.depth.build import depth_source
 from extrap_train.device import fastest_device
@@ -34,10 +34,10 @@ from extrap_train.pictures import contact_sheet, film, mark_holes, picture, pict
 from extrap_train.tasks.scene_folder import claimed, result_folder, scene_options, whole_result
 from extrap_train.tasks.scene_inputs import (
     SceneInputs,
-    adapter_origin,
     device_of,
     input_frames,
     label_of,
+    learnt_frames,
     open_inputs,
     open_model,
     open_sequence,
@@ -108,8 +108,7 @@ def _say_shares(made: GeneratedViews, names: list[str], console: Console) -> Non
 def _compared(made: GeneratedViews, truth: View, inputs: SceneInputs, config: TrainConfig) -> str:
     if truth.name in {view.name for view in inputs.views}:
         return f"no PSNR: {truth.name} is an input itself; leave it out of input_frames"
-    origin = adapter_origin(config)
-    if origin and truth.name in origin.inputs and origin.scene == scene_address(str(config.scene)):
+    if truth.name in learnt_frames(config):
         return f"no PSNR: the adapter was trained on {truth.name}"
     found = float(psnr(quantised(made.images), quantised(truth.image[None])))
     return f"PSNR against the photograph: {found:.2f} dB"

@@ -12,8 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from extrap_train.config import LoraConfig
+from extrap_train.diffusion.adapter_card import AdapterOrigin
 from extrap_train.diffusion.checkpoint import load_model, save_model
 from extrap_train.diffusion.generator import DiffusionGenerator
+from extrap_train.diffusion.lora import add_adapter, save_adapter
 from extrap_train.pictures import picture_names
 from extrap_train.tasks.view import open_generator, open_views, walk
 
@@ -239,7 +242,16 @@ def test_what_cannot_be_used_is_one_line(refused, weights, tmp_path) -> None:
     assert "has 8 frames, fewer than the 9" in refused(*view, "orbit=90", "inputs=9")
 
 
-def test_no_held_out_view_is_painted_from_where_it_stands(
+def _adapter_of(weights: Path, folder: Path, *frames: str) -> Path:
+    """An adapter without effect that says it was trained on these."""
+    model = load_model(weights)
+    adapter = add_adapter(model, LoraConfig(rank=1), seed=0)
+    origin = AdapterOrigin("synthetic:hydrant/0000", list(frames), str(weights), {}, "")
+    save_adapter(model, adapter, folder, origin)
+    return folder
+
+
+def test_no_held_out_view_is_painted_from_where_it_stands_nor_by_who_has_learnt_it(
     command, weights, tmp_path, monkeypatch
 ) -> None:
     """Completed at the capture's own poses, the map has a view where each photograph was taken."""
@@ -251,9 +263,14 @@ def test_no_held_out_view_is_painted_from_where_it_stands(
         return generate(self, references, queries, names, seed)
 
     monkeypatch.setattr(DiffusionGenerator, "generate", recorded)
+    adapter = _adapter_of(weights, tmp_path / "adapter", "frame000001", "frame000005")
     options = ["complete.poses=capture", "complete.splats.fit=false", "sampler.steps=1"]
-    command("task=complete", f"weights={weights}", *options, "complete.confidence.attempts=1")
+    options += ["complete.confidence.attempts=1", f"adapter={adapter}"]
+    inputs = ",".join(f"frame00000{index}" for index in range(4))
+    command("task=complete", f"weights={weights}", *options, f"input_frames=[{inputs}]")
     summary = json.loads((tmp_path / "complete" / "hydrant_0000" / "summary.json").read_text())
-    assert summary["held_out"]["views"] == summary["views"]["generated"] == 4
-    assert len(asked) == 8
+    assert summary["views"]["generated"] == 4
+    assert summary["held_out"]["views"] == 3
+    assert len(asked) == 7
+    assert "frame000005" not in [name for name, _ in asked[4:]]
     assert not [name for name, references in asked if name in references]
