@@ -220,15 +220,36 @@ def test_gradient_checkpointing_learns_the_same_with_less_memory(config: ModelCo
     assert peaks[1] < 0.8 * peaks[0]
 
 
-def test_it_ends_where_the_held_out_pair_gains_no_more_or_the_time_is_up(
+def _adapter_of(model: ExtrapolationModel) -> dict[str, Tensor]:
+    return {name: p.detach() for name, p in model.named_parameters() if ".lora_" in name}
+
+
+def test_it_ends_where_the_held_out_pair_gains_no_more_and_keeps_the_best_step(
     config: ModelConfig,
 ) -> None:
-    """A rate that destroys the model never gains: the base is kept."""
+    """Not the last: its weights are those of a training that ended where the best was."""
     model, done = _adapt(config, steps=400, learning_rate=30.0, patience=2)
+    losses = dict(done.losses)
     assert done.ended == "held-out pair"
-    assert done.steps <= 40
-    if done.best_step == 0:
-        assert not any(p.any() for n, p in model.named_parameters() if "lora_B" in n)
+    assert 0 < done.best_step == min(losses, key=losses.__getitem__)
+    assert done.steps == done.best_step + 2 * OPTIONS.validate_every
+    shorter, ended_there = _adapt(config, steps=done.best_step, learning_rate=30.0, patience=2)
+    assert ended_there.best_step == ended_there.steps == done.best_step
+    for name, kept in _adapter_of(model).items():
+        assert torch.equal(kept, _adapter_of(shorter)[name]), name
+
+
+def test_the_base_is_kept_where_no_step_gains(config: ModelConfig) -> None:
+    """A rate that destroys the model at once."""
+    model, done = _adapt(config, steps=400, learning_rate=1e8, patience=2)
+    assert (done.best_step, done.ended) == (0, "held-out pair")
+    assert done.steps == 2 * OPTIONS.validate_every
+    written = [p for name, p in _adapter_of(model).items() if ".lora_B" in name]
+    assert written
+    assert not any(p.any() for p in written)
+
+
+def test_it_ends_where_the_time_is_up(config: ModelConfig) -> None:
     _, timed = _adapt(config, steps=400, seconds=0.2)
     assert timed.ended == "time"
     assert timed.steps < 400

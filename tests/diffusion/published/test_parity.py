@@ -8,6 +8,7 @@ from pathlib import Path
 import kornia
 import pytest
 import torch
+from batches import batch_of
 from published_networks import Reference, tiny_config
 from torch import Tensor
 
@@ -129,7 +130,9 @@ def test_clip_sees_what_zero123_shows_it() -> None:
 def test_widening_leaves_the_output_as_it_was(
     references: dict[str, Reference], tmp_path: Path, family: str
 ) -> None:
-    """Whatever the new channels say, the widened denoiser starts as ZeroNVS's, bit for bit."""
+    """Whatever the new channels say, the widened denoiser starts as ZeroNVS's, but for rounding: a
+    convolution of more channels adds its zeros in another order.
+    """
     path = tmp_path / "zeronvs.ckpt"
     torch.save({"state_dict": references["zeronvs"].state}, path)
     start = tiny_config("zeronvs", start=str(path))
@@ -143,3 +146,20 @@ def test_widening_leaves_the_output_as_it_was(
     before = published.unet(given["unet_input"], given["unet_timestep"], token).sample
     after = widened.unet(told, given["unet_timestep"], token).sample
     torch.testing.assert_close(after, before, atol=1e-6, rtol=0)
+
+
+@torch.no_grad()
+def test_ours_says_of_a_view_what_zeronvs_said_before_it_is_trained(
+    references: dict[str, Reference], tmp_path: Path
+) -> None:
+    """The whole models, each with its own condition: photographs, poses, CLIP, VAE and token."""
+    path = tmp_path / "zeronvs.ckpt"
+    torch.save({"state_dict": references["zeronvs"].state}, path)
+    start = tiny_config("zeronvs", start=str(path))
+    views, noisy, step = batch_of(1, size=256), torch.randn(1, 4, 32, 32), torch.tensor([500])
+    said = []
+    for family in ("zeronvs", "ours"):
+        model = initial_model(replace(start, family=family)).eval()
+        said.append(model(noisy, step, model.condition(views)))
+    assert said[0].std() > 1e-3
+    torch.testing.assert_close(said[1], said[0], atol=1e-5 * float(said[0].std()), rtol=0)
