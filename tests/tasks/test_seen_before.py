@@ -6,18 +6,26 @@ from pathlib import Path
 
 import pytest
 
-from extrap_train.config import SyntheticConfig
+from extrap_train.config import (
+    CategoryConfig,
+    DatasetDepthConfig,
+    FlowMatcherConfig,
+    ModelConfig,
+    SyntheticConfig,
+    TrainConfig,
+)
 from extrap_train.diffusion.packaged import MODEL_CONFIG, packaged_names, packaged_weights
 from extrap_train.errors import InputError
+from extrap_train.tasks import category
 from extrap_train.tasks.seen_before import require_unseen
 from extrap_train.trained_on import CategoryData, TrainedOn
 
 
-def _split(test: int, seed: int | None = 0, category: str = "hydrant") -> TrainedOn:
+def _split(test: int, seed: int | None = 0, of: str = "hydrant") -> TrainedOn:
     """Of rendered captures, the first `test` of which are held out."""
     names = tuple(f"{index:04d}" for index in range(12))
     data = CategoryData("synthetic", "key", "split", names[test:], names[:test], seed)
-    return TrainedOn({category: data})
+    return TrainedOn({of: data})
 
 
 def _model(run: Path, start: str | None, trained_on: TrainedOn | None) -> str:
@@ -43,7 +51,7 @@ def test_every_packaged_model_says_what_it_has_seen(name: str) -> None:
     "unseen",
     [
         _split(7, seed=1),
-        _split(7, category="vase"),
+        _split(7, of="vase"),
         TrainedOn({"hydrant": replace(_split(7).categories["hydrant"], source="co3d")}),
     ],
 )
@@ -57,7 +65,7 @@ def test_random_weights_have_seen_nothing() -> None:
 
 def test_a_start_goes_back_to_its_own_start(tmp_path: Path) -> None:
     """Its run, of other objects, says nothing of what the packaged base has seen."""
-    own = _model(tmp_path / "run", "base", _split(5, category="vase"))
+    own = _model(tmp_path / "run", "base", _split(5, of="vase"))
     require_unseen(own, _split(5))
     with pytest.raises(InputError, match=r"0005, 0006 of hydrant, by way of base"):
         require_unseen(own, _split(7))
@@ -75,3 +83,22 @@ def test_a_run_counts_for_what_it_was_trained_on(tmp_path: Path) -> None:
 def test_a_model_that_says_nothing_is_taken_at_that(tmp_path: Path) -> None:
     require_unseen(_model(tmp_path / "run", None, None), _split(7))
     require_unseen(str(tmp_path / "published.ckpt"), _split(7))
+
+
+def test_a_training_that_would_hold_out_what_its_start_has_seen_is_not_begun(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(category, "prepared_data", lambda _: [])
+    monkeypatch.setattr(category, "data_module", lambda *_: None)
+    monkeypatch.setattr(TrainedOn, "of", lambda *_: _split(7))
+    config = TrainConfig(
+        category=CategoryConfig("hydrant", ["hydrant"]),
+        data=SyntheticConfig(test_sequences=7),
+        depth=DatasetDepthConfig(),
+        matcher=FlowMatcherConfig(),
+        model=ModelConfig(name="small", start="base"),
+        output=str(tmp_path / "out"),
+    )
+    with pytest.raises(InputError, match="start=base was trained on 0005, 0006"):
+        category.run(config)
+    assert not (tmp_path / "out").exists()
