@@ -206,7 +206,7 @@ def load_weights(
 def _require_same_start(path: Path, config: ModelConfig) -> None:
     """InputError where the same tensors would mean something else than they do in a saved model."""
     saved = saved_config(path)
-    keys = ("prediction", "unet.heads", "unet.norm_groups", "clip.heads")
+    keys: tuple[str, ...] = ("prediction", "unet.heads", "unet.norm_groups", "clip.heads")
     if saved.family == config.family:
         keys += ("residual",)
     before, now = dotted(asdict(saved)), dotted(asdict(config))

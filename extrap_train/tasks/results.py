@@ -92,12 +92,12 @@ def write_results(
 
 
 def draw_views(prediction: Prediction, path: Path) -> None:
-    """Reference, warp, output, truth and error, a row per view."""
+    """Reference, warp, output, truth and error, a row per view, named as in `validation.csv`."""
     batch, images = prediction.batch, prediction.images
     assert batch.warp is not None
     contact_sheet(
         {
-            "nearest photo": images["nearest"],
+            "reference": images["nearest"],
             "warp": mark_holes(batch.warp.image, batch.warp.mask),
             "inpainted": images["inpainted"],
             "model": images["model"],
@@ -105,6 +105,7 @@ def draw_views(prediction: Prediction, path: Path) -> None:
             "error": error_map(images["model"], batch.image),
         },
         path,
+        prediction.names,
     )
 
 
