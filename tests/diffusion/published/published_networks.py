@@ -19,6 +19,16 @@ TINY_UNET = UNetConfig(
     norm_groups=32,
 )
 
+TINY_MODEL = [
+    "prep.image_size=512",
+    "model.unet.channels=[32,64,128,128]",
+    "model.vae.channels=[32,64,128,128]",
+    "model.clip.width=128",
+    "model.clip.layers=2",
+    "model.clip.heads=2",
+]
+"""The same size on the command line."""
+
 
 @dataclass(frozen=True)
 class Reference:

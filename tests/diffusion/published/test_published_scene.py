@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from PIL import Image
-from published_networks import Reference, tiny_config
+from published_networks import TINY_MODEL, Reference, tiny_config
 from safetensors.torch import load_file
 
 from extrap_train.__main__ import main
@@ -15,21 +15,19 @@ from extrap_train.diffusion.checkpoint import initial_model, save_model
 from extrap_train.errors import InputError
 from extrap_train.tasks.view import open_generator
 
-_TINY = [
-    "prep.image_size=512",
-    "model.unet.channels=[32,64,128,128]",
-    "model.vae.channels=[32,64,128,128]",
-    "model.clip.width=128",
-    "model.clip.layers=2",
-    "model.clip.heads=2",
-]
 _SCENE = ["category=hydrant", "scene=synthetic:hydrant/0000", "data.frames=6", "data.image_size=32"]
 
 
 @pytest.fixture
 def command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     def run(family: str, weights: Path, *arguments: str) -> None:
-        options = [*_SCENE, *_TINY, f"model={family}", f"weights={weights}", f"output={tmp_path}"]
+        options = [
+            *_SCENE,
+            *TINY_MODEL,
+            f"model={family}",
+            f"weights={weights}",
+            f"output={tmp_path}",
+        ]
         quick = ["trainer.precision=32-true", "sampler.steps=1", "sampler.guidance=1"]
         monkeypatch.setattr(sys, "argv", ["extrap_train", *options, *quick, *arguments])
         main()

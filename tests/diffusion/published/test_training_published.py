@@ -1,18 +1,23 @@
 """A published checkpoint trains for a few steps, is saved, comes back and paints a view.
 
+`_trains` takes the model's loss and the optimiser in a loop of its own: no Trainer, no averaged
+weights, no warm-up. The last test has these: it gives the tiny network to the real task.
+
 The full size takes 17 GiB and some minutes: `pytest -m slow tests/diffusion/published`.
 """
 
 import json
 import resource
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from published_networks import Reference, configured, tiny_config
+from published_networks import TINY_MODEL, Reference, configured, tiny_config
 
 from benchmarks.perf.diffusion_case import batch_of
+from extrap_train.__main__ import main
 from extrap_train.config import ModelConfig, SamplerConfig, TrainConfig, TrainerConfig
 from extrap_train.diffusion.checkpoint import initial_model, load_model, save_model
 from extrap_train.diffusion.loss import diffusion_loss
@@ -77,3 +82,51 @@ def test_the_full_size_within_20_gib(shared: Path, seeded, tmp_path: Path) -> No
     peak_gib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"peak resident memory: {peak_gib:.1f} GiB")
     assert peak_gib < 20
+
+
+def test_the_task_trains_a_tiny_one_with_average_and_warm_up(
+    references: dict[str, Reference], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is saved is the average, with the decay 2/11 that it has at its second step."""
+    state = references["zeronvs"].state
+    torch.save({"state_dict": state}, tmp_path / "zeronvs.ckpt")
+    options = [
+        "category=hydrant",
+        "model=zeronvs",
+        f"model.start={tmp_path / 'zeronvs.ckpt'}",
+        *TINY_MODEL,
+        "data.train_sequences=1",
+        "data.test_sequences=1",
+        "data.frames=12",
+        "data.image_size=32",
+        "prep.max_gap_deg=60",
+        "prep.max_uses=1",
+        "trainer.steps=2",
+        "trainer.batch_size=1",
+        "trainer.warmup_steps=2",
+        "trainer.checkpoint_every=1",
+        "trainer.validate_every=1",
+        "trainer.precision=32-true",
+        "validation.examples=1",
+        "sampler.steps=1",
+        "sampler.guidance=1",
+        f"output={tmp_path}",
+    ]
+    monkeypatch.setattr(sys, "argv", ["extrap_train", *options])
+    main()
+    run = (tmp_path / "train" / "hydrant" / "zeronvs" / "latest").resolve()
+    assert json.loads((run / "summary.json").read_text())["steps"] == 2
+    first, second = (
+        torch.load(run / "checkpoints" / f"step-0000000{step}.ckpt", weights_only=True)
+        for step in (1, 2)
+    )
+    name = "model.unet.conv_out.weight"
+    start = state["model.diffusion_model.out.2.weight"]
+    trained = [checkpoint["current_model_state"][name] for checkpoint in (first, second)]
+    averaged = [checkpoint["state_dict"][name] for checkpoint in (first, second)]
+    moved = float((trained[0] - start).abs().max())
+    assert moved == pytest.approx(0.5e-4, rel=0.05)  # Adam's first step, at half the rate
+    expected = averaged[0].lerp(trained[1], 9 / 11)
+    torch.testing.assert_close(averaged[1], expected, atol=1e-8, rtol=0)
+    assert not torch.equal(averaged[1], trained[1])
+    assert torch.equal(load_model(run / "model").unet.conv_out.weight, averaged[1])
