@@ -102,7 +102,7 @@ def _is_consistent(matches: Matches, first: Camera, second: Camera) -> bool:
 
 def epipolar_distance(
     first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"], one: Camera, two: Camera
-) -> Float[np.ndarray, "m"]:
+) -> Float[np.ndarray, " m"]:
     """Mean of each match's two distances, in pixels, to the other's epipolar line (the "symmetric
     epipolar distance"), from the given poses.
     """

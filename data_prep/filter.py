@@ -89,7 +89,7 @@ def azimuth_coverage(cameras: Camera) -> tuple[float, float]:
     return float(gaps[-2]), float(360 - gaps[-1])
 
 
-def _sorted_gaps_deg(azimuths_rad: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+def _sorted_gaps_deg(azimuths_rad: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     azimuths = np.degrees(np.sort(azimuths_rad))
     return np.sort(np.diff(azimuths, append=azimuths[:1] + 360))
 

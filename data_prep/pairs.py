@@ -78,7 +78,7 @@ class PairFiles:
             write_sealed(table, made / TABLE, self.key, {FLOWS: flows.astype(np.float16)})
 
 
-def reference_frames(depth_share: Float[np.ndarray, "n"], lone: bool) -> Bool[np.ndarray, "n"]:
+def reference_frames(depth_share: Float[np.ndarray, " n"], lone: bool) -> Bool[np.ndarray, " n"]:
     """Which frames may be references."""
     known = depth_share >= MIN_DEPTH_SHARE
     return known & ~held_out(len(known)) if lone else known

@@ -17,10 +17,10 @@ _TIE = 1e6
 class Selection:
     """Ordered pairs (reference → query) of one sequence, best score first."""
 
-    reference: Int[np.ndarray, "m"]
-    query: Int[np.ndarray, "m"]
-    angle_rad: Float[np.ndarray, "m"]
-    score: Float[np.ndarray, "m"]
+    reference: Int[np.ndarray, " m"]
+    query: Int[np.ndarray, " m"]
+    angle_rad: Float[np.ndarray, " m"]
+    score: Float[np.ndarray, " m"]
 
 
 def pair_score(angle_rad: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
@@ -32,8 +32,8 @@ def pair_score(angle_rad: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
 def select_pairs(
     angles_rad: Float[np.ndarray, "n n"],
     options: PrepConfig,
-    queries: Bool[np.ndarray, "n"] | None = None,
-    references: Bool[np.ndarray, "n"] | None = None,
+    queries: Bool[np.ndarray, " n"] | None = None,
+    references: Bool[np.ndarray, " n"] | None = None,
 ) -> Selection:
     """Greedy choice of pairs: best score first, limited uses of a frame, no near-duplicates.
 
@@ -59,7 +59,7 @@ def select_pairs(
 
 def _candidates(
     angles_rad: Float[np.ndarray, "n n"], options: PrepConfig, allowed: Bool[np.ndarray, "n n"]
-) -> tuple[Int[np.ndarray, "c"], Int[np.ndarray, "c"]]:
+) -> tuple[Int[np.ndarray, " c"], Int[np.ndarray, " c"]]:
     """Unordered pairs (lower index first) within the range of angles, best score first."""
     wide = angles_rad >= np.radians(options.min_pair_angle_deg)
     narrow = angles_rad <= np.radians(options.max_pair_angle_deg)

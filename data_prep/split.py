@@ -68,7 +68,7 @@ def split_sequences(sequences: Sequence[str], test: Collection[str] | int) -> Sp
     return Split(train, tuple(sorted(tested)), tuple(lone))
 
 
-def held_out(frames: int) -> Bool[np.ndarray, "n"]:
+def held_out(frames: int) -> Bool[np.ndarray, " n"]:
     """Which frames of a lone sequence are for testing."""
     return np.arange(frames) % HELD_OUT_EVERY == HELD_OUT_EVERY - 1
 

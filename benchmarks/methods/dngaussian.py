@@ -179,7 +179,7 @@ class DnGaussianRecipe(Recipe):
             remove(training.optimiser, training.statistics, unwanted)
 
     @torch.no_grad()
-    def _misplaced(self, parameters: GaussianParameters) -> Bool[Tensor, "n"]:
+    def _misplaced(self, parameters: GaussianParameters) -> Bool[Tensor, " n"]:
         before = torch.zeros_like(parameters.opacity_logits, dtype=torch.bool)
         seen = before.clone()
         for camera, nearest in zip(self.cameras, self._nearest_expected, strict=True):

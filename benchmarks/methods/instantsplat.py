@@ -91,7 +91,7 @@ class InstantSplatRecipe(Recipe):
         return similarity_between(self.cameras, refined).camera(cameras)
 
 
-def confidence_factor(confidence: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+def confidence_factor(confidence: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
     """Step of each mean: 1 + 99 · (1 − sigmoid(c)), c the confidence on DUSt3R's scale.
 
     DUSt3R's confidences start at 1 and have no end; ours lie in [0, 1], and 1 / (1 − ours) is of

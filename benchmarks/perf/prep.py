@@ -168,7 +168,7 @@ def table_of(seconds: dict[str, float], frames: int, pairs: int) -> list[str]:
 def _two_against_one(
     sequences: Sequence[captures.Sequence], one: Launcher, two: Launcher, folder: Path
 ) -> Row:
-    def errors(launcher: Launcher) -> Float[Tensor, "m"]:
+    def errors(launcher: Launcher) -> Float[Tensor, " m"]:
         """What a preparation from nothing finds for every pair."""
         output = Path(tempfile.mkdtemp(dir=folder))
         data = prepare(

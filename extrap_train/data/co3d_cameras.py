@@ -23,7 +23,7 @@ class Cameras:
 
     world_to_cam: Float[np.ndarray, "n 4 4"]
     intrinsics: Float[np.ndarray, "n 3 3"]
-    sound: Bool[np.ndarray, "n"]
+    sound: Bool[np.ndarray, " n"]
 
 
 def cameras_of(annotations: list[FrameAnnotation], file: Path) -> Cameras:

@@ -67,16 +67,16 @@ class Co3dFrames(ListOf[Frame]):
     """
 
     root: Path
-    number: Int[np.ndarray, "n"]
+    number: Int[np.ndarray, " n"]
     size: Int[np.ndarray, "n 2"]
     """(height, width) in pixels."""
     world_to_cam: Float[np.ndarray, "n 4 4"]
     intrinsics: Float[np.ndarray, "n 3 3"]
-    image_path: Shaped[np.ndarray, "n"]
-    mask_path: Shaped[np.ndarray, "n"]
-    depth_path: Shaped[np.ndarray, "n"]
-    depth_mask_path: Shaped[np.ndarray, "n"]
-    depth_scale: Float[np.ndarray, "n"]
+    image_path: Shaped[np.ndarray, " n"]
+    mask_path: Shaped[np.ndarray, " n"]
+    depth_path: Shaped[np.ndarray, " n"]
+    depth_mask_path: Shaped[np.ndarray, " n"]
+    depth_scale: Float[np.ndarray, " n"]
 
     @classmethod
     def of(
@@ -120,7 +120,7 @@ class Co3dFrames(ListOf[Frame]):
     def _columns(cls) -> list[str]:
         return [field.name for field in fields(cls) if field.name != "root"]
 
-    def _taken(self, rows: Shaped[np.ndarray, "m"]) -> "Co3dFrames":
+    def _taken(self, rows: Shaped[np.ndarray, " m"]) -> "Co3dFrames":
         """These rows alone, by their indices or a mask."""
         return replace(self, **{name: getattr(self, name)[rows] for name in self._columns()})
 
@@ -178,7 +178,7 @@ class Co3dFrames(ListOf[Frame]):
         )
 
 
-def _encoded(paths: Iterable[str | None]) -> Shaped[np.ndarray, "n"]:
+def _encoded(paths: Iterable[str | None]) -> Shaped[np.ndarray, " n"]:
     return np.array([os.fsencode(path or "") for path in paths])
 
 

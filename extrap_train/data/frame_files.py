@@ -43,7 +43,7 @@ class StoredFrames:
 
     folder: Path
     camera: Camera
-    depth_share: Float[np.ndarray, "n"]
+    depth_share: Float[np.ndarray, " n"]
     """Of each frame's pixels, how many have a depth."""
     depth_scale: float
 

@@ -58,15 +58,15 @@ class Pairs:
     """The pairs of one split as columns; an item or an iteration gives `ViewPair`s."""
 
     sequence: np.ndarray
-    query: Int[np.ndarray, "m"]
-    reference: Int[np.ndarray, "m"]
-    angle_rad: Float[np.ndarray, "m"]
-    score: Float[np.ndarray, "m"]
-    flow: Int[np.ndarray, "m"]
+    query: Int[np.ndarray, " m"]
+    reference: Int[np.ndarray, " m"]
+    angle_rad: Float[np.ndarray, " m"]
+    score: Float[np.ndarray, " m"]
+    flow: Int[np.ndarray, " m"]
     """Number of the pair's flow in its sequence; `UNTOUCHED` of none."""
-    error_before: Float[np.ndarray, "m"]
+    error_before: Float[np.ndarray, " m"]
     """Photometric error of the warp against the truth; NaN where nothing was compared."""
-    error_after: Float[np.ndarray, "m"]
+    error_after: Float[np.ndarray, " m"]
     uncorrected: np.ndarray
     """Why a compared warp stays as it is; else empty."""
 
@@ -149,7 +149,7 @@ class PreparedData:
         """The frames' names, in their order."""
         return self._names[self._rows[sequence]].to_pylist()
 
-    def reference_frames(self, sequence: str) -> Int[np.ndarray, "m"]:
+    def reference_frames(self, sequence: str) -> Int[np.ndarray, " m"]:
         """The frames that may serve as references: not held out, and with some depth known."""
         return np.flatnonzero(self._reference[self._rows[sequence]])
 
@@ -171,11 +171,11 @@ class PreparedData:
         """Whether the training pairs have been compared with the truth (METHOD §6)."""
         return bool(self.manifest["correction"])
 
-    def partners(self, sequence: str, query: int) -> Int[np.ndarray, "m"]:
+    def partners(self, sequence: str, query: int) -> Int[np.ndarray, " m"]:
         """The frames that make a training pair with this query, so that their flow is known."""
         return np.flatnonzero(self._flow_numbers(sequence)[:, query] >= UNTOUCHED)
 
-    def queries(self, sequence: str, reference: int) -> Int[np.ndarray, "m"]:
+    def queries(self, sequence: str, reference: int) -> Int[np.ndarray, " m"]:
         """The frames that make a training pair with this reference."""
         return np.flatnonzero(self._flow_numbers(sequence)[reference] >= UNTOUCHED)
 

@@ -50,7 +50,7 @@ def inverse_depth_range(
 
 
 def _seen(
-    camera: Camera, neighbours: list[Camera], candidates: Float[Tensor, "d"]
+    camera: Camera, neighbours: list[Camera], candidates: Float[Tensor, " d"]
 ) -> tuple[float, float]:
     small = camera.resized(16, 16)
     inverse_depth = candidates.to(camera.intrinsics)[:, None, None].expand(-1, 16, 16)

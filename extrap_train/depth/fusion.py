@@ -31,7 +31,7 @@ def fused(estimates: Sequence[DepthMap]) -> DepthMap:
 
 
 def weighted_median(
-    values: Float[Tensor, "k *n"], weights: Float[Tensor, "k *n"]
+    values: Float[Tensor, "k ..."], weights: Float[Tensor, "k ..."]
 ) -> Float[Tensor, "*n"]:
     """The least value that, with all below it, has half the weight; anything where that is 0."""
     order = values.argsort(0)

@@ -27,7 +27,7 @@ class Line:
 
 
 def robust_line(
-    x: Float[Tensor, "n"], y: Float[Tensor, "n"], weights: Float[Tensor, "n"]
+    x: Float[Tensor, " n"], y: Float[Tensor, " n"], weights: Float[Tensor, " n"]
 ) -> Line | None:
     """The line with the least median residual over random pairs (Rousseeuw, 1984), refined by
     reweighted least squares with Cauchy's weights.
@@ -61,7 +61,7 @@ def robust_line(
 
 
 def _least_squares(
-    x: Float[Tensor, "n"], y: Float[Tensor, "n"], weights: Float[Tensor, "n"]
+    x: Float[Tensor, " n"], y: Float[Tensor, " n"], weights: Float[Tensor, " n"]
 ) -> Line:
     share = weights / weights.sum()
     mean_x, mean_y = (share * x).sum(), (share * y).sum()

@@ -36,8 +36,8 @@ class _Points:
     """Pixels of a view with their depth, and how far to trust it."""
 
     pixels: Float[Tensor, "n 2"]
-    depth: Float[Tensor, "n"]
-    weights: Float[Tensor, "n"]
+    depth: Float[Tensor, " n"]
+    weights: Float[Tensor, " n"]
 
 
 class NotAligned(InputError):
@@ -157,7 +157,7 @@ class MonocularDepth:
         return _Points(matches.first[good], found.depth[good], weights[good])
 
 
-def _sample(values: Float[Tensor, "h w"], pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
+def _sample(values: Float[Tensor, "h w"], pixels: Float[Tensor, "n 2"]) -> Float[Tensor, " n"]:
     size = pixels.new_tensor([values.shape[1], values.shape[0]])
     return functional.grid_sample(
         values[None, None],

@@ -63,7 +63,7 @@ def _badness(offsets: Float[Tensor, "n 3"], limit_rad: float) -> Float[Tensor, "
     return torch.where(useful, 10 * outside + middle, torch.inf)
 
 
-def _by_turns(badness: Float[Tensor, "n"], on_right: Tensor, count: int) -> list[int]:
+def _by_turns(badness: Float[Tensor, " n"], on_right: Tensor, count: int) -> list[int]:
     order = [i for i in badness.argsort().tolist() if math.isfinite(badness[i])]
     sides = [[i for i in order if bool(on_right[i]) is right] for right in (False, True)]
     if order and order[0] in sides[1]:

@@ -29,7 +29,7 @@ def steps_across(
     steps: Float[Tensor, "n 2"],
     reference: Camera,
     query: Camera,
-) -> Float[Tensor, "n"]:
+) -> Float[Tensor, " n"]:
     """How far, in pixels, points of the query's picture leave their epipolar lines; ≥ 0."""
     along = epipolar_directions(pixels, reference, query)
     return (steps[:, 0] * along[:, 1] - steps[:, 1] * along[:, 0]).abs()

@@ -40,7 +40,7 @@ def flow_at(
     return torch.einsum("ni,nj,cij->nc", down.to(control), across.to(control), control)
 
 
-def bspline_basis(positions: Float[Tensor, "n"], count: int) -> Float[Tensor, "n g"]:
+def bspline_basis(positions: Float[Tensor, " n"], count: int) -> Float[Tensor, "n g"]:
     """Uniform cubic B-splines at positions in [−1, 1] (clamped to it); every row sums to 1."""
     knots = (positions.clamp(-1, 1) + 1) / 2 * (count - 3)
     apart = (knots[:, None] + 1 - torch.arange(count, device=positions.device)).abs()
@@ -52,9 +52,9 @@ def bspline_basis(positions: Float[Tensor, "n"], count: int) -> Float[Tensor, "n
 def fit_flow(
     positions: Float[Tensor, "n 2"],
     displacements: Float[Tensor, "n 2"],
-    weights: Float[Tensor, "n"],
+    weights: Float[Tensor, " n"],
     grid: int,
-) -> tuple[Float[Tensor, "2 g g"], Bool[Tensor, "n"]]:
+) -> tuple[Float[Tensor, "2 g g"], Bool[Tensor, " n"]]:
     """The smooth field through most of the displacements, and which of them it believes.
 
     Weighted least squares with a little stiffness, repeated without the matches whose residual is
@@ -87,7 +87,7 @@ def fit_flow(
 def least_squares_flow(
     positions: Float[Tensor, "n 2"],
     displacements: Float[Tensor, "n 2"],
-    weights: Float[Tensor, "n"],
+    weights: Float[Tensor, " n"],
     grid: int,
     stiffness: float,
 ) -> Float[Tensor, "2 g g"]:
@@ -107,7 +107,7 @@ def _design(positions: Float[Tensor, "n 2"], grid: int) -> Float[Tensor, "n m"]:
 def _solve(
     design: Float[Tensor, "n m"],
     target: Float[Tensor, "n 2"],
-    weights: Float[Tensor, "n"],
+    weights: Float[Tensor, " n"],
     bending: Float[Tensor, "m m"],
 ) -> Float[Tensor, "m 2"]:
     """Weighted least squares; the weights' sum stands for the number of matches."""

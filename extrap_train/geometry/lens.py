@@ -125,7 +125,7 @@ def _opencv_matrix(lens: Lens) -> Float[np.ndarray, "3 3"]:
     return replace(lens, cx=lens.cx - _OPENCV_CENTRE, cy=lens.cy - _OPENCV_CENTRE).matrix
 
 
-def _coefficients(lens: Lens) -> Float[np.ndarray, "k"]:
+def _coefficients(lens: Lens) -> Float[np.ndarray, " k"]:
     """OpenCV takes 4, 5 or 8 numbers; missing ones are zero."""
     wanted = next(n for n in (4, 5, 8) if n >= len(lens.distortion))
     return np.array(lens.distortion + (0.0,) * (wanted - len(lens.distortion)), np.float64)

@@ -17,16 +17,16 @@ OUTSIDE = -10.0
 class ScreenPoints:
     """Points seen by cameras of one image size: `image` says by which, in ascending order."""
 
-    u: Float[Tensor, "n"]
-    v: Float[Tensor, "n"]
-    depth: Float[Tensor, "n"]
+    u: Float[Tensor, " n"]
+    v: Float[Tensor, " n"]
+    depth: Float[Tensor, " n"]
     """Positive."""
-    reach_u: Float[Tensor, "n"]
+    reach_u: Float[Tensor, " n"]
     """Half the width, in pixels up to 1, of the piece of surface that the point stands for."""
-    reach_v: Float[Tensor, "n"]
-    image: Int[Tensor, "n"]
+    reach_v: Float[Tensor, " n"]
+    image: Int[Tensor, " n"]
 
-    def __getitem__(self, chosen: Int[Tensor, "m"]) -> "ScreenPoints":
+    def __getitem__(self, chosen: Int[Tensor, " m"]) -> "ScreenPoints":
         """The points with these indices."""
         return replace(self, **{name: column[chosen] for name, column in vars(self).items()})
 
@@ -55,7 +55,7 @@ def splat_torch(
 
 def _footprints(
     points: ScreenPoints, size: tuple[int, int, int]
-) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"], Float[Tensor, "m"], Bool[Tensor, "m"]]:
+) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"], Float[Tensor, " m"], Bool[Tensor, " m"]]:
     """Pairs of a pixel (flat index) and a point near it, their kernel, and whether the point
     reaches its centre."""
     _, h, w = size

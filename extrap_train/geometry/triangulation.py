@@ -14,11 +14,11 @@ from extrap_train.views import Camera
 class Triangulated:
     """One point a match."""
 
-    depth: Float[Tensor, "n"]
+    depth: Float[Tensor, " n"]
     """In the first camera; not positive where the rays part."""
-    parallax_rad: Float[Tensor, "n"]
+    parallax_rad: Float[Tensor, " n"]
     """Between the two viewing rays."""
-    error: Float[Tensor, "n"]
+    error: Float[Tensor, " n"]
     """From the match in the second picture to where the point is seen, in pixels."""
 
 

@@ -25,9 +25,9 @@ class Orbit:
     axis: Float[np.ndarray, "3"]
     """Unit length; points where the cameras' image-up points on average."""
     center: Float[np.ndarray, "3"]
-    azimuths_rad: Float[np.ndarray, "n"]
+    azimuths_rad: Float[np.ndarray, " n"]
     """In [0, 2π), from an arbitrary zero; means nothing near the axis."""
-    elevations_rad: Float[np.ndarray, "n"]
+    elevations_rad: Float[np.ndarray, " n"]
     """Towards the axis, in [-π/2, π/2]."""
 
 
@@ -61,7 +61,7 @@ def directions_from(cameras: Camera, center: Float[np.ndarray, "3"]) -> Float[np
 
 def facing(
     cameras: Camera, center: Float[np.ndarray, "3"], within_rad: float
-) -> Bool[np.ndarray, "n"]:
+) -> Bool[np.ndarray, " n"]:
     """Which cameras have the centre within an angle of their optical axis."""
     forward = cameras.forward.double().numpy(force=True)
     cosine = -(forward * directions_from(cameras, center)).sum(1)
@@ -102,8 +102,8 @@ def fit_orbit(cameras: Camera) -> Orbit:
 
 
 def nearest_references(
-    angles_to_query_rad: Float[np.ndarray, "n"], count: int
-) -> Int[np.ndarray, "k"]:
+    angles_to_query_rad: Float[np.ndarray, " n"], count: int
+) -> Int[np.ndarray, " k"]:
     """Indices of the `count` views with the smallest angle, nearest first, ties by index."""
     return np.argsort(angles_to_query_rad, kind="stable")[:count]
 
@@ -130,7 +130,7 @@ def extra_references(
     first: int,
     count: int,
     rng: np.random.Generator,
-    allowed: Int[np.ndarray, "m"],
+    allowed: Int[np.ndarray, " m"],
 ) -> tuple[int, ...]:
     """Draw references behind the first, up to `count` with it; `first` stays the nearest.
 
@@ -151,7 +151,7 @@ def extra_references(
 
 def farthest_point_sample(
     positions: Float[np.ndarray, "n d"], count: int, start: int = 0
-) -> Int[np.ndarray, "k"]:
+) -> Int[np.ndarray, " k"]:
     """Indices of points, each the farthest from those before it; ties by index (METHOD §7)."""
     if not 1 <= count <= len(positions):
         raise ValueError(f"cannot choose {count} of {len(positions)} points")

@@ -15,7 +15,7 @@ from extrap_train.views import Camera
 
 def moved_points(
     points: ScreenPoints,
-    reference: Int[Tensor, "n"],
+    reference: Int[Tensor, " n"],
     flows: Float[Tensor, "b k 2 g g"],
     query: Camera,
 ) -> ScreenPoints:

@@ -37,7 +37,7 @@ class Samples:
     points: ScreenPoints
     values: Float[Tensor, "n 7"]
     """Colour (3), coordinates in the nearest reference (2) and whether it is from there, depth."""
-    reference: Int[Tensor, "n"]
+    reference: Int[Tensor, " n"]
     """Which of the b·k references a point is from, in ascending order."""
 
 
@@ -127,7 +127,7 @@ class _Corner:
 
     @classmethod
     def around(
-        cls, surface: Surface, pixel: Int[Tensor, "m"], offset: Float[Tensor, "m 2"]
+        cls, surface: Surface, pixel: Int[Tensor, " m"], offset: Float[Tensor, "m 2"]
     ) -> "_Corner":
         """Pick them by the signs of the offset."""
         h, w = surface.inverse_depth.shape[-2:]
@@ -140,7 +140,7 @@ class _Corner:
         neighbour = pixel[:, None] + torch.where(connected, step, 0)
         return cls(surface.slopes.reshape(-1)[flat], neighbour)
 
-    def steps(self, offset: Float[Tensor, "m 2"]) -> Float[Tensor, "m"]:
+    def steps(self, offset: Float[Tensor, "m 2"]) -> Float[Tensor, " m"]:
         """Change of inverse depth from the pixel's centre."""
         across, down = (self.slope * offset).unbind(-1)
         return across + down
@@ -148,9 +148,9 @@ class _Corner:
     def interpolate(
         self,
         rows: Float[Tensor, "n c"],
-        pixel: Int[Tensor, "m"],
+        pixel: Int[Tensor, " m"],
         offset: Float[Tensor, "m 2"],
-        chosen: Int[Tensor, "s"],
+        chosen: Int[Tensor, " s"],
     ) -> Float[Tensor, "s c"]:
         """Values at the chosen points: the pixel's own, blended with both neighbours'."""
         own = rows[pixel[chosen]]

@@ -39,7 +39,7 @@ def hidden_by_unseen(
     cameras: Camera,
     query: Camera,
     points: ScreenPoints,
-) -> Bool[Tensor, "n"]:
+) -> Bool[Tensor, " n"]:
     """Which points lie behind space that their reference never saw; here `image` counts the b·k
     references."""
     column = points.u.long().clamp(0, query.width - 1)
@@ -114,11 +114,11 @@ def _run(connected: Bool[Tensor, "n h w"]) -> Int[Tensor, "n h w"]:
 
 def _length(
     matrix: Float[Tensor, "n 3 4"],
-    u: Float[Tensor, "n"],
-    v: Float[Tensor, "n"],
-    start: Float[Tensor, "n"],
-    stop: Float[Tensor, "n"],
-) -> Float[Tensor, "n"]:
+    u: Float[Tensor, " n"],
+    v: Float[Tensor, " n"],
+    start: Float[Tensor, " n"],
+    stop: Float[Tensor, " n"],
+) -> Float[Tensor, " n"]:
     """Query pixels between the front and the back of each wall."""
     x0, y0, _ = project_pixels(matrix, u, v, start)
     x1, y1, _ = project_pixels(matrix, u, v, stop)

@@ -20,7 +20,7 @@ class Matches:
 
     first: Float[Tensor, "n 2"]
     second: Float[Tensor, "n 2"]
-    confidence: Float[Tensor, "n"]
+    confidence: Float[Tensor, " n"]
     """In (0, 1]. Ranks matches of one matcher; is no probability, nor comparable between two."""
 
     @property
@@ -32,7 +32,7 @@ class Matches:
         """How many there are."""
         return len(self.confidence)
 
-    def __getitem__(self, index: Bool[Tensor, "n"] | Tensor | slice) -> "Matches":
+    def __getitem__(self, index: Bool[Tensor, " n"] | Tensor | slice) -> "Matches":
         """Those at `index`."""
         return Matches(self.first[index], self.second[index], self.confidence[index])
 
@@ -72,7 +72,7 @@ class Matcher(Protocol):
         ...
 
 
-def known_at(known: Bool[Tensor, "h w"], pixels: Float[Tensor, "n 2"]) -> Bool[Tensor, "n"]:
+def known_at(known: Bool[Tensor, "h w"], pixels: Float[Tensor, "n 2"]) -> Bool[Tensor, " n"]:
     """Whether the pixel that holds each point is known; False outside the picture."""
     height, width = known.shape
     u, v = pixels.floor().long().unbind(-1)

@@ -20,8 +20,8 @@ SPLIT_SHRINK = 1.6
 class GrowthStatistics:
     """What the renderings since the last densification showed of each Gaussian."""
 
-    gradient: Float[Tensor, "n"]
-    visits: Float[Tensor, "n"]
+    gradient: Float[Tensor, " n"]
+    visits: Float[Tensor, " n"]
 
     @classmethod
     def empty(cls, means: Float[Tensor, "n 3"]) -> "GrowthStatistics":
@@ -32,7 +32,7 @@ class GrowthStatistics:
     def add(
         self,
         gradient: Float[Tensor, "n 2"],
-        radii: Float[Tensor, "n"],
+        radii: Float[Tensor, " n"],
         height: int,
         width: int,
     ) -> None:
@@ -42,13 +42,13 @@ class GrowthStatistics:
         self.gradient += torch.where(seen, ndc.norm(dim=-1), 0)
         self.visits += seen
 
-    def follow(self, kept: Bool[Tensor, "n"], added: int) -> None:
+    def follow(self, kept: Bool[Tensor, " n"], added: int) -> None:
         """The rows that are left, and new ones behind them that nothing has shown yet."""
         for name in ("gradient", "visits"):
             old = getattr(self, name)[kept]
             setattr(self, name, torch.cat([old, old.new_zeros(added)]))
 
-    def mean_gradient(self) -> Float[Tensor, "n"]:
+    def mean_gradient(self) -> Float[Tensor, " n"]:
         """Length of the gradient in NDC, a visit; 0 for Gaussians that were not seen."""
         return self.gradient / self.visits.clamp_min(1)
 
@@ -84,8 +84,8 @@ def grow(
 
 
 def strongest(
-    strength: Float[Tensor, "n"], wanted: Bool[Tensor, "n"], count: int
-) -> Bool[Tensor, "n"]:
+    strength: Float[Tensor, " n"], wanted: Bool[Tensor, " n"], count: int
+) -> Bool[Tensor, " n"]:
     """The `count` strongest of those that are wanted, ties by their place."""
     order = torch.where(wanted, strength, -math.inf).argsort(descending=True, stable=True)
     kept = torch.zeros_like(wanted)
@@ -131,7 +131,7 @@ def prune(
 
 @torch.no_grad()
 def remove(
-    optimiser: GaussianOptimiser, statistics: GrowthStatistics, unwanted: Bool[Tensor, "n"]
+    optimiser: GaussianOptimiser, statistics: GrowthStatistics, unwanted: Bool[Tensor, " n"]
 ) -> None:
     """Remove these Gaussians; if that were all of them, the most opaque one stays."""
     kept = ~unwanted

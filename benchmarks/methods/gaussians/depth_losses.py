@@ -10,7 +10,7 @@ _GLOBAL_SHARE = 0.01
 """Of the image's spread that a patch's own is raised by (DNGaussian, released code)."""
 
 
-def pearson(first: Float[Tensor, "n"], second: Float[Tensor, "n"]) -> Float[Tensor, ""]:
+def pearson(first: Float[Tensor, " n"], second: Float[Tensor, " n"]) -> Float[Tensor, ""]:
     """Correlation in [−1, 1]; 0 where one of them is constant."""
     a, b = first - first.mean(), second - second.mean()
     spread = a.norm() * b.norm()

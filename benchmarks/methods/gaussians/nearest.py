@@ -9,7 +9,7 @@ from torch import Tensor
 from extrap_train.views import Camera
 
 
-def nearest_expected(cameras: Sequence[Camera]) -> Float[Tensor, "v"]:
+def nearest_expected(cameras: Sequence[Camera]) -> Float[Tensor, " v"]:
     """Depth before which each camera of the frame has nothing in its picture; 0 if untold.
 
     Inputs around an object show it whole: it is inside the ball around the origin that a camera at

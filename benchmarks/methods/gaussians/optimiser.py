@@ -49,7 +49,7 @@ class GaussianOptimiser:
             means.copy_(before + means_factor * (means - before))
         self._adam.zero_grad(set_to_none=True)
 
-    def keep(self, rows: Bool[Tensor, "n"] | Int[Tensor, "m"]) -> None:
+    def keep(self, rows: Bool[Tensor, " n"] | Int[Tensor, " m"]) -> None:
         """Only these Gaussians are left, with their moments."""
         for group in self._adam.param_groups:
             self._replace(group, group["params"][0].detach()[rows], lambda moment: moment[rows])

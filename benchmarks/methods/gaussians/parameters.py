@@ -24,7 +24,7 @@ class GaussianParameters:
     log_scales: Float[Tensor, "n 3"]
     quats: Float[Tensor, "n 4"]
     """(w, x, y, z), of any length but 0."""
-    opacity_logits: Float[Tensor, "n"]
+    opacity_logits: Float[Tensor, " n"]
     sh_dc: Float[Tensor, "n 1 3"]
     """The constant spherical harmonic's coefficients, which have a learning rate of their own."""
     sh_rest: Float[Tensor, "n k 3"]
@@ -33,7 +33,7 @@ class GaussianParameters:
     def __len__(self) -> int:
         return len(self.means)
 
-    def __getitem__(self, rows: Bool[Tensor, "n"] | Int[Tensor, "m"]) -> "GaussianParameters":
+    def __getitem__(self, rows: Bool[Tensor, " n"] | Int[Tensor, " m"]) -> "GaussianParameters":
         return from_tensors({name: value[rows] for name, value in self.tensors().items()})
 
     @property
@@ -42,7 +42,7 @@ class GaussianParameters:
         return self.log_scales.exp()
 
     @property
-    def opacities(self) -> Float[Tensor, "n"]:
+    def opacities(self) -> Float[Tensor, " n"]:
         """In (0, 1)."""
         return self.opacity_logits.sigmoid()
 
@@ -66,7 +66,7 @@ def from_tensors(tensors: Mapping[str, Tensor]) -> GaussianParameters:
 
 
 def parameters_from_points(
-    points: Points, sh_degree: int, opacity: float, widest: Float[Tensor, "n"] | float = math.inf
+    points: Points, sh_degree: int, opacity: float, widest: Float[Tensor, " n"] | float = math.inf
 ) -> GaussianParameters:
     """One round Gaussian a point, as wide as the distance to its three neighbours (3DGS), but at
     most `widest`.

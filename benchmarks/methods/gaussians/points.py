@@ -25,13 +25,13 @@ class Points:
     positions: Float[Tensor, "n 3"]
     colors: Float[Tensor, "n 3"]
     """In [0, 1]."""
-    confidence: Float[Tensor, "n"]
+    confidence: Float[Tensor, " n"]
     """As depth sources give it; 1 for points that do not come from depth."""
 
     def __len__(self) -> int:
         return len(self.positions)
 
-    def __getitem__(self, index: Int[Tensor, "m"] | Bool[Tensor, "n"]) -> "Points":
+    def __getitem__(self, index: Int[Tensor, " m"] | Bool[Tensor, " n"]) -> "Points":
         return Points(self.positions[index], self.colors[index], self.confidence[index])
 
     def at_most(self, count: int, generator: torch.Generator) -> "Points":

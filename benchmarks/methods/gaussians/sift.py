@@ -63,7 +63,7 @@ def match(
     return np.stack([rows[kept], there[kept]], 1)
 
 
-def _second_best(distance: Float[np.ndarray, "n m"], axis: int) -> Float[np.ndarray, "k"]:
+def _second_best(distance: Float[np.ndarray, "n m"], axis: int) -> Float[np.ndarray, " k"]:
     """Of the descriptors on the line; infinite where there is one alone."""
     if distance.shape[axis] < 2:
         return np.full(distance.shape[1 - axis], np.inf)

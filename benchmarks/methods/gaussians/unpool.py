@@ -53,8 +53,8 @@ def unpooled(
 
 
 def isolated(
-    parameters: GaussianParameters, gap: Float[Tensor, "n"], proximity: float, scale: float
-) -> Int[Tensor, "s"]:
+    parameters: GaussianParameters, gap: Float[Tensor, " n"], proximity: float, scale: float
+) -> Int[Tensor, " s"]:
     """Numbers of the Gaussians that are large and far from their neighbours, farthest first."""
     chosen = (gap > proximity) & (parameters.scales.detach().amax(1) > scale)
     order = gap.argsort(descending=True, stable=True)
@@ -62,8 +62,8 @@ def isolated(
 
 
 def edges(
-    sources: Int[Tensor, "s"], neighbours: Int[Tensor, "n k"], pairing: Pairing
-) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"]]:
+    sources: Int[Tensor, " s"], neighbours: Int[Tensor, "n k"], pairing: Pairing
+) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"]]:
     """Both ends of every new edge, as Gaussian numbers."""
     targets = neighbours[sources].flatten()
     count = neighbours.shape[1]
