@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
 from rich.console import Console
 from rich.live import Live
 
@@ -29,7 +28,7 @@ from benchmarks.protocol import Protocol
 from benchmarks.results import read_results
 from benchmarks.reuse import finished
 from extrap_train.config import MethodConfig, SlurmConfig, TableConfig
-from extrap_train.data.files import write_whole
+from extrap_train.data.files import held_alone, write_whole
 from extrap_train.errors import InputError
 from extrap_train.jobs import Died, Launcher
 from extrap_train.jobs.local import LocalLauncher
@@ -58,13 +57,9 @@ def run_table(table: TableConfig, catalogue: Catalogue, options: RunOptions) -> 
     console = terminal()
     folder = TableFolder(Path(table.output) / table.name)
     _make_folder(folder)
-    try:
-        with FileLock(folder.path / ".lock", timeout=0):
-            return _run(table, catalogue, options, folder, console)
-    except Timeout:
-        raise InputError(
-            f"{folder.path}: another process runs this table; wait for it or give output=FOLDER"
-        ) from None
+    taken = f"{folder.path}: another process runs this table; wait for it or give output=FOLDER"
+    with held_alone(folder.path / ".lock", taken):
+        return _run(table, catalogue, options, folder, console)
 
 
 def _make_folder(folder: TableFolder) -> None:

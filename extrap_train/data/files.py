@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from filelock import FileLock
+from filelock import FileLock, Timeout
 from jaxtyping import Shaped
 
 from extrap_train.errors import InputError
@@ -135,6 +135,20 @@ def whole_folder(folder: Path, is_wanted: Callable[[Path], bool]) -> Iterator[Pa
         put_in_place(made, folder, is_wanted)
     finally:
         shutil.rmtree(made, ignore_errors=True)
+
+
+@contextmanager
+def held_alone(lock: Path, otherwise: str) -> Iterator[None]:
+    """What `lock` stands for, for this process alone as long as the block lasts.
+
+    Raises InputError, which says `otherwise`, where another process holds it.
+    """
+    try:
+        held = FileLock(lock).acquire(timeout=0)
+    except Timeout:
+        raise InputError(otherwise) from None
+    with held:
+        yield
 
 
 def put_in_place(made: Path, folder: Path, is_wanted: Callable[[Path], bool]) -> None:

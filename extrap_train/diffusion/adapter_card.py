@@ -1,4 +1,4 @@
-"""What a saved adapter says of itself, in words and for programs: the scene it was made for"""
+"""What a saved adapter says of itself, in words and for programs: the scene it was made for."""
 
 import shlex
 from dataclasses import dataclass

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, fields
@@ -16,7 +15,6 @@ from safetensors.torch import load_file
 from torch import nn
 
 from extrap_train.config import LoraConfig
-from extrap_train.data.files import partial_beside, write_whole
 from extrap_train.diffusion.adapter_card import DENOISER, OTHERS, AdapterOrigin, model_card
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError
@@ -59,23 +57,14 @@ def temporary_adapter(
 def save_adapter(
     model: ExtrapolationModel, adapter: peft.PeftModel, folder: Path, origin: AdapterOrigin
 ) -> None:
-    """Write a peft adapter folder, whole or not at all; an older one of that name is replaced.
+    """Write a peft adapter folder; `adapter` is what lies upon the model's denoiser.
 
-    `adapter` is what lies upon the model's denoiser.
+    File by file: that all of it appears at once is for the result that it is part of.
     """
-    temporary = partial_beside(folder)
-    shutil.rmtree(temporary, ignore_errors=True)
-    try:
-        adapter.save_pretrained(str(temporary))
-        hashes = base_hashes(model)
-        write_whole(temporary / _BASE, json.dumps(hashes | asdict(origin), indent=1).encode())
-        write_whole(temporary / _CARD, model_card(origin, hashes).encode())
-        if folder.exists():
-            shutil.rmtree(folder)
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        temporary.replace(folder)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    hashes = base_hashes(model)
+    adapter.save_pretrained(str(folder))
+    (folder / _BASE).write_text(json.dumps(hashes | asdict(origin), indent=1))
+    (folder / _CARD).write_text(model_card(origin, hashes))
 
 
 def saved_base_hashes(folder: Path) -> dict[str, str] | None:

@@ -11,10 +11,10 @@ from typing import Any, cast
 
 import lightning
 import torch
-from filelock import FileLock, Timeout
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from extrap_train.config import TrainConfig, placed
+from extrap_train.data.files import held_alone
 from extrap_train.data.module import PairModule
 from extrap_train.data.store import PreparedData
 from extrap_train.device import require_accelerator
@@ -32,7 +32,6 @@ from extrap_train.diffusion.layout import arranged
 from extrap_train.diffusion.memory import GIB, advice_where_memory_ends, training_memory
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.training import CategoryTraining
-from extrap_train.errors import InputError
 from extrap_train.metrics import lpips_or_reason
 from extrap_train.processes import Opening, announce, is_first, join
 from extrap_train.runs import (
@@ -94,19 +93,15 @@ def _opened(folder: RunFolder, config: TrainConfig, trained_on: TrainedOn) -> It
     if not is_first():
         yield join(folder.path)
         return
-    try:
-        with FileLock(folder.lock, timeout=0):
-            open_run(config, trained_on)
-            point_latest(folder)
-            newest = checkpoints(folder.checkpoints)[-1:]
-            is_over = folder.summary.is_file() and Finished.read(folder).answers(config)
-            opening = Opening(is_over, str(newest[0]) if newest else None)
-            announce(folder.path, opening)
-            yield opening
-    except Timeout:
-        raise InputError(
-            f"{folder.path}: another process is training this run; wait for it or give run=NAME"
-        ) from None
+    taken = f"{folder.path}: another process is training this run; wait for it or give run=NAME"
+    with held_alone(folder.lock, taken):
+        open_run(config, trained_on)
+        point_latest(folder)
+        newest = checkpoints(folder.checkpoints)[-1:]
+        is_over = folder.summary.is_file() and Finished.read(folder).answers(config)
+        opening = Opening(is_over, str(newest[0]) if newest else None)
+        announce(folder.path, opening)
+        yield opening
 
 
 def _train(

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from filelock import FileLock, Timeout
 from rich.console import Console
 from tqdm import tqdm
 
@@ -23,7 +22,7 @@ from extrap_train.config import (
     dotted,
     sampler_for,
 )
-from extrap_train.data.files import write_whole
+from extrap_train.data.files import held_alone, write_whole
 from extrap_train.data.photographs import CATEGORY
 from extrap_train.data.scene import SYNTHETIC_SCHEME, open_scene
 from extrap_train.data.sequences import Sequence
@@ -84,13 +83,9 @@ def run(config: TrainConfig) -> Path:
     job = _job(config)
     console = terminal()
     job.folder.mkdir(parents=True, exist_ok=True)
-    try:
-        with FileLock(job.folder / ".lock", timeout=0):
-            _run(job, console)
-    except Timeout:
-        raise InputError(
-            f"{job.folder}: another process is completing this scene; wait for it or give run=NAME"
-        ) from None
+    taken = f"{job.folder}: another process is completing this scene; wait for it or give run=NAME"
+    with held_alone(job.folder / ".lock", taken):
+        _run(job, console)
     return job.folder
 
 

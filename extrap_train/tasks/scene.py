@@ -81,7 +81,7 @@ def _run(
     )
     sampler = sampler_for(config.sampler, model.config)
     targets = _targets(config, inputs, model)
-    asked = _asked(config, model, inputs.views, targets, sampler)
+    asked = options | _content(model, inputs.views, targets, sampler)
     if config.resume and _is_done(folder, asked):
         console.print("already adapted with these options")
         return
@@ -142,29 +142,17 @@ def _origin(config: TrainConfig, inputs: SceneInputs, done: Adaptation) -> Adapt
     )
 
 
-def _asked(
-    config: TrainConfig,
-    model: ExtrapolationModel,
-    views: list[View],
-    targets: list[View],
-    sampler: SamplerConfig,
+def _content(
+    model: ExtrapolationModel, views: list[View], targets: list[View], sampler: SamplerConfig
 ) -> dict[str, Any]:
-    """All that the result follows from: weights and views by their content, not by their names."""
+    """What the result follows from beside the options: weights and views by what is in them."""
     return {
-        "scene": config.scene,
         "inputs": [view.name for view in views],
         "held_out": [view.name for view in targets],
         "views": _digest(views + targets),
-        "weights": config.weights,
         "model": asdict(model.config),
         "base": base_hashes(model),
-        "depth": asdict(config.depth),
-        "lora": asdict(config.lora),
         "sampler": asdict(sampler),
-        "precision": config.trainer.precision,
-        "lpips": config.validation.lpips_weights,
-        "minutes": config.minutes,
-        "seed": config.seed,
     }
 
 

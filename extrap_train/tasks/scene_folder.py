@@ -7,10 +7,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
-
 from extrap_train.config import SyntheticConfig, TrainConfig, dotted
-from extrap_train.data.files import remove_partial, whole_folder, write_whole
+from extrap_train.data.files import held_alone, remove_partial, whole_folder, write_whole
 from extrap_train.data.scene import SYNTHETIC_SCHEME, scene_address
 from extrap_train.errors import InputError
 from extrap_train.runs import given_name
@@ -54,16 +52,13 @@ def claimed(folder: Path, options: dict[str, Any], *, resume: bool) -> Iterator[
     with other options. Interrupted, the block leaves what was there before.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
+    taken = f"{folder}: another process is making this; wait for it or give run=NAME"
     try:
-        with FileLock(folder.with_name(f".{folder.name}.lock"), timeout=0):
+        with held_alone(folder.with_name(f".{folder.name}.lock"), taken):
             if resume and folder.exists():
                 require_same(folder / MADE_WITH, options, "replace it")
             remove_partial(folder.parent)
             yield
-    except Timeout:
-        raise InputError(
-            f"{folder}: another process is making this; wait for it or give run=NAME"
-        ) from None
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
             "nothing was changed; the same command starts from the beginning"

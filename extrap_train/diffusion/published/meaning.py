@@ -5,13 +5,14 @@ trace in a tensor's name or shape.
 """
 
 import inspect
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from transformers import CLIPVisionConfig
 
+from extrap_train.data.json_files import read_json
+from extrap_train.data.validation import require_dict
 from extrap_train.errors import InputError
 
 SCHEDULER = "scheduler"
@@ -59,7 +60,6 @@ _KEYS: dict[str, dict[str, str]] = {
     },
 }
 """What is compared, with the option that sets it, where one does."""
-_REMEDY = "give a whole diffusers folder"
 
 
 def require_same_meaning(folder: Path, networks: Mapping[str, Any], *, to_train: bool) -> None:
@@ -69,12 +69,12 @@ def require_same_meaning(folder: Path, networks: Mapping[str, Any], *, to_train:
     without a JSON file says nothing. The noise of the last step may be another in what is
     `to_train`: models are trained on to zero terminal SNR (Lin et al. 2023).
     """
-    for part, network in networks.items():
-        path = folder / part / _FILES.get(part, "")
-        if part not in _KEYS or not hasattr(network, "config") or not path.is_file():
+    for part, keys in _KEYS.items():
+        path, network = folder / part / _FILES[part], networks.get(part)
+        if not hasattr(network, "config") or not path.is_file():
             continue
         said, own = _read(path), _known(network)
-        for key, option in _KEYS[part].items():
+        for key, option in keys.items():
             if to_train and key == "rescale_betas_zero_snr":
                 continue
             found = _value(said, key, _default(network, key))
@@ -87,14 +87,7 @@ def require_same_meaning(folder: Path, networks: Mapping[str, Any], *, to_train:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    try:
-        said = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path}: cannot be read ({error}); give a whole diffusers folder"
-        ) from None
-    if not isinstance(said, dict):
-        raise InputError(f"{path}: holds no table of settings; {_REMEDY}")
+    said = require_dict(read_json(path), "a table of settings, as in a diffusers folder", path)
     inner = said.get("vision_config")  # of a whole CLIP
     return inner if isinstance(inner, dict) else said
 
