@@ -24,8 +24,8 @@ from benchmarks.provenance import versions
 from benchmarks.scenes import Scene
 from benchmarks.scoring import Score, score_files
 from extrap_train.config import MethodConfig, ScoringConfig
-from extrap_train.data.files import write_whole
 from extrap_train.data.json_files import read_json
+from extrap_train.store.atomic import write_atomic
 
 OK, FAILED, UNAVAILABLE = "ok", "failed", "unavailable"
 _DRAW = ("category", "sequence", "n_views", "draw", "seed")
@@ -133,8 +133,8 @@ def write_cell(folder: Path, record: Mapping[str, Any], files: Mapping[str, byte
     shutil.rmtree(workshop, ignore_errors=True)
     try:
         for name, content in files.items():
-            write_whole(workshop / name, content)
-        write_whole(workshop / "cell.json", json_bytes(record))
+            write_atomic(workshop / name, content)
+        write_atomic(workshop / "cell.json", json_bytes(record))
         shutil.rmtree(folder, ignore_errors=True)
         workshop.replace(folder)
     finally:

@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Float
 
 from extrap_train.config import RulesConfig
-from extrap_train.data.files import write_whole
 from extrap_train.data.json_files import read_json
 from extrap_train.errors import InputError
 from extrap_train.geometry.viewpoints import (
@@ -23,6 +22,7 @@ from extrap_train.geometry.viewpoints import (
     pairwise_angles,
     scene_center,
 )
+from extrap_train.store.atomic import write_atomic
 from extrap_train.views import Camera
 
 FORMAT = 1
@@ -67,7 +67,7 @@ class Protocol:
         content = self._content()
         draws = ",\n  ".join(json.dumps(draw) for draw in content.pop("draws"))
         head = json.dumps({**content, "sha256": self.sha256})
-        write_whole(file, f'{head[:-1]},\n "draws": [\n  {draws}\n ]}}\n'.encode())
+        write_atomic(file, f'{head[:-1]},\n "draws": [\n  {draws}\n ]}}\n'.encode())
 
     @classmethod
     def read(cls, file: Path) -> "Protocol":

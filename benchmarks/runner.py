@@ -28,11 +28,11 @@ from benchmarks.protocol import Protocol
 from benchmarks.results import read_results
 from benchmarks.reuse import finished
 from extrap_train.config import MethodConfig, SlurmConfig, TableConfig
-from extrap_train.data.files import held_alone, write_whole
 from extrap_train.errors import InputError
 from extrap_train.jobs import Died, Launcher
 from extrap_train.jobs.local import LocalLauncher
 from extrap_train.jobs.slurm import slurm_launcher
+from extrap_train.store.atomic import file_lock, write_atomic
 from extrap_train.terminal import terminal
 
 
@@ -58,7 +58,7 @@ def run_table(table: TableConfig, catalogue: Catalogue, options: RunOptions) -> 
     folder = TableFolder(Path(table.output) / table.name)
     _make_folder(folder)
     taken = f"{folder.path}: another process runs this table; wait for it or give output=FOLDER"
-    with held_alone(folder.path / ".lock", taken):
+    with file_lock(folder.path / ".lock", taken):
         return _run(table, catalogue, options, folder, console)
 
 
@@ -101,7 +101,7 @@ def _run(
     for job in done:
         progress.note(job.method.name, OK)
     problems = _make(waiting, table, options, folder, progress, console)
-    write_whole(folder.plan, json_bytes(plan))
+    write_atomic(folder.plan, json_bytes(plan))
     # Light to import only where it is needed: the reports draw.
     from benchmarks.report import write_reports
 

@@ -17,12 +17,12 @@ from benchmarks.methods.base import Stopwatch
 from benchmarks.protocol import Draw
 from benchmarks.scenes import FORMAT, Scene
 from extrap_train.config import DatasetDepthConfig, DepthConfig, RulesConfig, StereoConfig
-from extrap_train.data.files import write_whole
 from extrap_train.data.module import with_warp
 from extrap_train.data.queries import query_batch
 from extrap_train.depth.build import depth_source
 from extrap_train.errors import InputError
 from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
+from extrap_train.store.atomic import write_atomic
 from extrap_train.views import Camera, View, stack_cameras
 
 DEPTHS: Mapping[str, DepthConfig] = {"dataset": DatasetDepthConfig(), "stereo": StereoConfig()}
@@ -43,7 +43,7 @@ def prepare_scene(
     shutil.rmtree(workshop, ignore_errors=True)
     try:
         record = _write_scene(workshop, capture, draw, rules)
-        write_whole(workshop / "scene.json", json_bytes({**record, "origin": origin}))
+        write_atomic(workshop / "scene.json", json_bytes({**record, "origin": origin}))
         shutil.rmtree(folder, ignore_errors=True)
         workshop.replace(folder)
     finally:
@@ -99,7 +99,7 @@ def _write_scene(folder: Path, capture: Capture, draw: Draw, rules: RulesConfig)
         contents["truth/object.npy"] = npy_bytes(surface.object)
         contents["truth/surroundings.npy"] = npy_bytes(surface.surroundings)
     for name, content in contents.items():
-        write_whole(folder / name, content)
+        write_atomic(folder / name, content)
     return {
         "format": FORMAT,
         "draw": asdict(draw),

@@ -22,14 +22,14 @@ from data_prep.tables import Outcome, write_results
 from data_prep.tools import Tools, put_away
 from data_prep.unit import NO_SPACE, Unit, Workshop, prepare_unit
 from extrap_train.config import DepthConfig, MatcherConfig, PrepConfig
-from extrap_train.data.files import remove_partial
+from extrap_train.data.prepared import FORMAT, PreparedData
 from extrap_train.data.sequences import Sequence
-from extrap_train.data.store import FORMAT, PreparedData
 from extrap_train.depth import DepthSource
 from extrap_train.errors import InputError
 from extrap_train.jobs import Died, Launcher
 from extrap_train.jobs.local import LocalLauncher
 from extrap_train.matching import Matcher
+from extrap_train.store.atomic import remove_leftovers
 
 LOG = logging.getLogger(__name__)
 HERE = LocalLauncher(1)
@@ -110,7 +110,7 @@ def prepare(
         (folder / "manifest.json").unlink(missing_ok=True)
         outcomes, split = _make_all(plan, launcher, progress)
         for place in (folder, *shop.frames.glob("*/*"), *shop.pairs.glob("*/*")):
-            remove_partial(place)
+            remove_leftovers(place)
         write_results(folder, shop, outcomes, split, {**plan.keys, "data": source})
     except OSError as error:
         if error.errno not in NO_SPACE:

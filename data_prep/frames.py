@@ -12,9 +12,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from data_prep.split import held_out
-from extrap_train.data.files import file_stamp
 from extrap_train.data.frame_files import SequenceFrames
 from extrap_train.data.images import to_eight_bits
+from extrap_train.data.paths import file_stamp
 from extrap_train.data.sequences import Sequence
 from extrap_train.depth import DepthSource
 from extrap_train.errors import InputError

@@ -18,7 +18,6 @@ from data_prep.select import select_pairs
 from data_prep.split import held_out
 from data_prep.tools import Tools
 from extrap_train.config import PrepConfig
-from extrap_train.data.files import whole_folder
 from extrap_train.data.frame_files import (
     FLOWS,
     StoredFrames,
@@ -29,6 +28,7 @@ from extrap_train.data.frame_files import (
 )
 from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
 from extrap_train.matching import Matcher
+from extrap_train.store.atomic import atomic_folder
 
 MIN_DEPTH_SHARE = 0.02
 """A frame with less of its depth known cannot be a reference: its warp would be empty."""
@@ -73,7 +73,7 @@ class PairFiles:
 
     def write(self, pairs: pd.DataFrame, flows: Float[np.ndarray, "m 2 g g"]) -> None:
         """Both files, whole or not at all."""
-        with whole_folder(self.folder, lambda _: self.are_there()) as made:
+        with atomic_folder(self.folder, lambda _: self.are_there()) as made:
             table = pa.Table.from_pandas(pairs, preserve_index=False)
             write_sealed(table, made / TABLE, self.key, {FLOWS: flows.astype(np.float16)})
 

@@ -18,9 +18,9 @@ from data_prep.report_pairs import (
     share_corrected,
 )
 from data_prep.split import held_out
-from extrap_train.data.files import write_whole
-from extrap_train.data.store import Pairs, PreparedData
+from extrap_train.data.prepared import Pairs, PreparedData
 from extrap_train.geometry.viewpoints import fit_orbit
+from extrap_train.store.atomic import write_atomic
 
 SAMPLES = 8
 """Pairs on the picture sheet, from the easiest to the hardest."""
@@ -37,8 +37,8 @@ def write_report(data: PreparedData, console: Console) -> Path:
     dropped = data.sequences[~data.sequences["kept"]]
     reasons = _reasons(dropped)
     _print(facts, reasons, console)
-    write_whole(folder / "histograms.png", as_png(histograms(data)))
-    write_whole(folder / "coverage.png", as_png(coverage(data)))
+    write_atomic(folder / "histograms.png", as_png(histograms(data)))
+    write_atomic(folder / "coverage.png", as_png(coverage(data)))
     pairs = data.pairs("train")
     pair_sheet(data, _from_easy_to_hard(pairs, SAMPLES), folder / "pairs.png")
     listed = list(dropped[["sequence", "reason"]].head(_LISTED).itertuples(index=False, name=None))
@@ -51,7 +51,7 @@ def write_report(data: PreparedData, console: Console) -> Path:
         unlisted=len(dropped) - len(listed),
         **correction_report(data, folder),
     )
-    write_whole(page, content.encode())
+    write_atomic(page, content.encode())
     console.print(f"report: {page}")
     return page
 

@@ -9,10 +9,10 @@ import torch
 from matplotlib.figure import Figure
 
 from data_prep.reasons import kinds_of
-from extrap_train.data.files import write_whole
-from extrap_train.data.store import UNTOUCHED, Pairs, PreparedData
+from extrap_train.data.prepared import UNTOUCHED, Pairs, PreparedData
 from extrap_train.geometry.warp import warp_references
 from extrap_train.pictures import colour_depth, contact_sheet, error_map, mark_holes
+from extrap_train.store.atomic import write_atomic
 from extrap_train.views import PairBatch, stack_cameras
 
 WORST = 20
@@ -26,7 +26,7 @@ def correction_report(data: PreparedData, folder: Path) -> dict[str, Any]:
     pairs = data.pairs("train")
     order = np.argsort(-np.nan_to_num(pairs.error_after, nan=-1.0), kind="stable")
     worst = [int(index) for index in order[:WORST]]
-    write_whole(folder / "correction.png", as_png(error_histogram(pairs)))
+    write_atomic(folder / "correction.png", as_png(error_histogram(pairs)))
     pair_sheet(data, worst, folder / "worst.png")
     return {"corrections": correction_facts(data), "worst": [_row(data, pairs, i) for i in worst]}
 

@@ -13,7 +13,6 @@ from extrap_train.config import SyntheticConfig
 from extrap_train.data.annotations import read_sequence_annotations
 from extrap_train.data.co3d import FRAME_ANNOTATIONS, SEQUENCE_ANNOTATIONS
 from extrap_train.data.co3d_writer import write_annotations, write_frame, write_sequence
-from extrap_train.data.files import partial_beside, put_in_place, remove_partial, write_whole
 from extrap_train.data.synthetic import (
     build_scene,
     handheld_orbit,
@@ -24,6 +23,7 @@ from extrap_train.data.synthetic import (
 )
 from extrap_train.errors import InputError
 from extrap_train.jobs import Died, Launcher
+from extrap_train.store.atomic import install_folder, partial_path, remove_leftovers, write_atomic
 
 LOOK = 2
 """Raised whenever the same options give other pictures, so that old ones are not mixed with new."""
@@ -75,7 +75,7 @@ def synthesize(config: SyntheticConfig, category: str, root: Path, launcher: Lau
     missing = [job for job, state in zip(jobs, states, strict=True) if state != "ready"]
     _announce(category, root, states)
     _render_all(missing, launcher)
-    remove_partial(root / category)
+    remove_leftovers(root / category)
     records = [_read_record(job.folder) for job in jobs]
     _annotate(root, category, [record for record in records if record], config.test_sequences)
 
@@ -155,7 +155,7 @@ def _render_sequence(job: _Job) -> None:
     scene = build_scene(job.category, job.index, options["seed"])
     seed = walk_seed(job.category, job.index, options["seed"])
     cameras = handheld_orbit(scene, options["frames"], options["image_size"], seed)
-    workshop = partial_beside(job.folder)
+    workshop = partial_path(job.folder)
     try:
         frames = [
             write_frame(workshop, job.category, job.name, number, render(scene, cameras[number]))
@@ -171,8 +171,8 @@ def _render_sequence(job: _Job) -> None:
         )
         made = workshop / job.category / job.name
         record = {"options": options, "frames": frames, "sequence": sequence}
-        write_whole(made / RECORD, json.dumps(record).encode())
-        put_in_place(made, job.folder, lambda _: _state(job) == "ready")
+        write_atomic(made / RECORD, json.dumps(record).encode())
+        install_folder(made, job.folder, lambda _: _state(job) == "ready")
     finally:
         shutil.rmtree(workshop, ignore_errors=True)
 
@@ -193,7 +193,7 @@ def _annotate(
         [record["sequence"] for record in records],
         {"test": names[:test_sequences], "train": names[test_sequences:]},
     )
-    write_whole(stamp, content.encode())
+    write_atomic(stamp, content.encode())
 
 
 def _text(path: Path) -> str | None:

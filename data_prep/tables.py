@@ -17,12 +17,12 @@ from data_prep.filter import Verdict
 from data_prep.pairs import reference_frames
 from data_prep.split import Split
 from data_prep.unit import Unit, Workshop
-from extrap_train.data.files import partial_beside, write_whole
 from extrap_train.data.frame_files import read_camera_table
+from extrap_train.data.prepared import FORMAT
 from extrap_train.data.sequences import Sequence
-from extrap_train.data.store import FORMAT
 from extrap_train.errors import InputError
 from extrap_train.runs import package_version
+from extrap_train.store.atomic import partial_path, write_atomic
 
 _PACKAGES = ("extrap-train", "numpy", "opencv-python-headless", "pyarrow", "torch")
 """Whose versions may show in what is stored."""
@@ -71,7 +71,7 @@ def write_results(
     rows = pa.Table.from_pandas(_sequence_rows(outcomes, split, counts), preserve_index=False)
     with _writer(folder / "sequences.parquet") as write:
         write(rows)
-    write_whole(folder / "split.json", split.to_json().encode())
+    write_atomic(folder / "split.json", split.to_json().encode())
     failed = sum(outcome.failed for outcome in outcomes)
     manifest = {
         "format": FORMAT,
@@ -90,7 +90,7 @@ def write_results(
         "pairs": dict(sorted(parts.items())),
         "versions": {name: package_version(name) for name in _PACKAGES},
     }
-    write_whole(folder / "manifest.json", (json.dumps(manifest, indent=1) + "\n").encode())
+    write_atomic(folder / "manifest.json", (json.dumps(manifest, indent=1) + "\n").encode())
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ class _Rows:
 @contextmanager
 def _writer(file: Path) -> Iterator[Any]:
     """A function that takes the rows of `file`, which is there whole or not at all."""
-    temporary = partial_beside(file)
+    temporary = partial_path(file)
     rows = _Rows(temporary)
     try:
         yield rows.add

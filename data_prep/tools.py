@@ -22,7 +22,7 @@ from extrap_train.config import (
     MatcherConfig,
     MonocularConfig,
 )
-from extrap_train.data.files import file_stamp
+from extrap_train.data.paths import file_stamp
 from extrap_train.depth import DepthSource
 from extrap_train.depth.build import depth_source
 from extrap_train.device import fastest_device

@@ -16,9 +16,9 @@ from matplotlib import font_manager
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from extrap_train.data.files import write_whole
 from extrap_train.data.images import to_eight_bits
 from extrap_train.errors import InputError
+from extrap_train.store.atomic import write_atomic
 
 _HOLE_COLOUR = (1.0, 0.0, 1.0)
 _LEAST_TILE_PIXELS = 128
@@ -82,7 +82,7 @@ def contact_sheet(
     if captions:
         said = zip(range(rows), captions, strict=True)
         texts |= {(4, strip + row * pitch + 1): " ".join(text.split()) for row, text in said}
-    write_whole(path, _written_on(sheet, texts))
+    write_atomic(path, _written_on(sheet, texts))
 
 
 def _written_on(sheet: np.ndarray, texts: dict[tuple[int, int], str]) -> bytes:
@@ -109,14 +109,14 @@ def curve(steps: list[int], series: dict[str, list[float]], label: str, path: Pa
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=100)
     plt.close(figure)
-    write_whole(path, content.getvalue())
+    write_atomic(path, content.getvalue())
 
 
 def picture(image: Float[Tensor, "3 h w"], path: Path) -> None:
     """One picture, pixel by pixel, written as PNG."""
     content = io.BytesIO()
     Image.fromarray(to_eight_bits(image).transpose(1, 2, 0)).save(content, "png")
-    write_whole(path, content.getvalue())
+    write_atomic(path, content.getvalue())
 
 
 def picture_names(names: Sequence[str]) -> list[str]:

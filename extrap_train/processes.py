@@ -12,8 +12,8 @@ from typing import Any, TypeVar, cast
 import torch.distributed as dist
 from lightning.pytorch.utilities import rank_zero_only
 
-from extrap_train.data.files import write_whole
 from extrap_train.errors import InputError
+from extrap_train.store.atomic import write_atomic
 
 T = TypeVar("T")
 
@@ -51,7 +51,7 @@ def is_first() -> bool:
 def announce(folder: Path, opening: Opening) -> None:
     """Tell the other processes of this launch that the run is open."""
     content = {"launch": _launch(), "opening": asdict(opening)}
-    write_whole(_word(folder), json.dumps(content).encode())
+    write_atomic(_word(folder), json.dumps(content).encode())
 
 
 def join(folder: Path, wait_s: float = _WAIT_S) -> Opening:

@@ -20,8 +20,8 @@ from extrap_train.config import (
     placed,
     placed_value,
 )
-from extrap_train.data.files import partial_beside, remove_partial, write_whole
 from extrap_train.errors import InputError
+from extrap_train.store.atomic import partial_path, remove_leftovers, write_atomic
 from extrap_train.trained_on import TRAINED_ON, TrainedOn
 
 _NOT_PART_OF_THE_RUN = (
@@ -162,7 +162,7 @@ def open_run(config: TrainConfig, trained_on: TrainedOn) -> RunFolder:
     else:
         _start_over(folder)
         trained_on.write(folder.data)
-    write_whole(folder.options, yaml.safe_dump(_said(config), sort_keys=False).encode())
+    write_atomic(folder.options, yaml.safe_dump(_said(config), sort_keys=False).encode())
     return folder
 
 
@@ -194,9 +194,9 @@ def _runs_of(config: TrainConfig) -> Path:
 
 def _start_over(folder: RunFolder) -> None:
     """Remove the run at once: killed meanwhile, nothing of it is taken for the new one's."""
-    remove_partial(folder.path.parent)
+    remove_leftovers(folder.path.parent)
     if folder.path.exists():
-        removed = partial_beside(folder.path)
+        removed = partial_path(folder.path)
         folder.path.rename(removed)
         shutil.rmtree(removed)
 
@@ -248,7 +248,7 @@ def _default(config: Any, key: str) -> Any:
 def point_latest(folder: RunFolder) -> None:
     """Let `latest` mean this run: once its data are known to be usable."""
     link = folder.path.with_name(_LATEST)
-    temporary = partial_beside(link)
+    temporary = partial_path(link)
     temporary.unlink(missing_ok=True)
     temporary.symlink_to(folder.path.name)
     temporary.replace(link)

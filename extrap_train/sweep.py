@@ -21,8 +21,8 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from extrap_train.data.files import write_whole
 from extrap_train.errors import InputError, did_you_mean
+from extrap_train.store.atomic import write_atomic
 from extrap_train.sweep_seeds import over_seeds
 
 Row = dict[str, str]
@@ -145,7 +145,7 @@ def add_row(file: Path, row: Row) -> list[Row]:
         table = csv.DictWriter(text, [*_HEAD, *dict.fromkeys(names), _LAST], restval="")
         table.writeheader()
         table.writerows(rows)
-        write_whole(file, text.getvalue().encode())
+        write_atomic(file, text.getvalue().encode())
     return rows
 
 
@@ -183,7 +183,7 @@ def draw(rows: list[Row], file: Path) -> None:
         axes.bar_label(axes.containers[0], fmt="%.3g", fontsize=8)
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=120)
-    write_whole(file, content.getvalue())
+    write_atomic(file, content.getvalue())
 
 
 def compare_over_seeds(rows: list[Row], file: Path) -> None:
@@ -204,7 +204,7 @@ def compare_over_seeds(rows: list[Row], file: Path) -> None:
     columns = {
         m.removeprefix(METRIC): [float(row.get(m, math.nan)) for row in done] for m in metrics
     }
-    write_whole(file, over_seeds(first, labels, [row["seed"] for row in done], columns).encode())
+    write_atomic(file, over_seeds(first, labels, [row["seed"] for row in done], columns).encode())
 
 
 def _shown_metrics(rows: list[Row]) -> list[str]:

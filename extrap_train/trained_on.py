@@ -5,11 +5,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from extrap_train.data.files import write_whole
 from extrap_train.data.json_files import read_json
-from extrap_train.data.store import PreparedData
+from extrap_train.data.prepared import PreparedData
 from extrap_train.data.validation import require_dict
 from extrap_train.errors import InputError
+from extrap_train.store.atomic import write_atomic
 
 TRAINED_ON = "data.json"
 """In a run's folder, beside its model; beside the packaged models likewise."""
@@ -104,7 +104,7 @@ class TrainedOn:
     def write(self, file: Path) -> None:
         """As JSON, whole or not at all."""
         content = {name: asdict(data) for name, data in self.categories.items()}
-        write_whole(file, (json.dumps(content, indent=1) + "\n").encode())
+        write_atomic(file, (json.dumps(content, indent=1) + "\n").encode())
 
     def require_same(self, file: Path, otherwise: str = START_OVER) -> None:
         """InputError unless a run was trained on the same, as `file` says.

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from data_prep.build import prepare
 from extrap_train.config import PrepConfig
+from extrap_train.data.prepared import PreparedData
 from extrap_train.data.sequences import Sequence
-from extrap_train.data.store import PreparedData
 from extrap_train.depth.dataset import DatasetDepth
 
 

@@ -9,7 +9,7 @@ from benchmarks.report.page import page
 from benchmarks.report.plots import plots
 from benchmarks.report.text import latex, markdown, tables
 from benchmarks.results import Results
-from extrap_train.data.files import write_whole
+from extrap_train.store.atomic import write_atomic
 
 FORMATS = ("csv", "md", "latex", "html")
 
@@ -38,5 +38,5 @@ def write_reports(
         contents |= {f"plots/{plot}.svg": svg.encode() for plot, svg in drawn.items()}
         contents["index.html"] = page(results, layout, drawn).encode()
     for file, content in contents.items():
-        write_whole(folder.path / file, content)
+        write_atomic(folder.path / file, content)
     return [folder.path / file for file in contents]

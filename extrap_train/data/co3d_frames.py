@@ -14,7 +14,6 @@ from torch import Tensor
 
 from extrap_train.data.annotations import DepthFiles, FrameAnnotation
 from extrap_train.data.co3d_cameras import Cameras, cameras_of, frame_label
-from extrap_train.data.files import resolve_inside
 from extrap_train.data.images import (
     known_depth,
     read_depth_mask,
@@ -22,6 +21,7 @@ from extrap_train.data.images import (
     read_mask,
     read_sixteen_bit,
 )
+from extrap_train.data.paths import resolve_inside
 from extrap_train.data.sequences import Frame
 from extrap_train.data.validation import degenerate_camera
 from extrap_train.views import Camera, View

@@ -18,9 +18,9 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from extrap_train.data.co3d import FRAME_ANNOTATIONS, SEQUENCE_ANNOTATIONS
-from extrap_train.data.files import write_whole
 from extrap_train.data.images import to_eight_bits
 from extrap_train.geometry.pytorch3d import viewpoint_from_camera
+from extrap_train.store.atomic import write_atomic
 from extrap_train.views import Camera, View
 
 JPEG_QUALITY = 95
@@ -37,7 +37,7 @@ def write_frame(
     """
     folder, stem = f"{category}/{sequence_name}", f"frame{frame_number:06d}"
     image_path = f"{folder}/images/{stem}.jpg"
-    write_whole(root / image_path, _jpeg(view.image))
+    write_atomic(root / image_path, _jpeg(view.image))
     return {
         "sequence_name": sequence_name,
         "frame_number": frame_number,
@@ -59,7 +59,7 @@ def write_sequence(
 ) -> dict[str, Any]:
     """Write the point cloud, colours in [0, 1]; returns the entry for `write_annotations`."""
     path = f"{category}/{sequence_name}/pointcloud.ply"
-    write_whole(root / path, _ply(points, colors))
+    write_atomic(root / path, _ply(points, colors))
     return {
         "sequence_name": sequence_name,
         "category": category,
@@ -94,9 +94,9 @@ def write_annotations(
         for subset in ("train", "val", "test")
     }
     folder = root / category
-    write_whole(folder / "set_lists" / f"set_lists_{set_list}.json", json.dumps(subsets).encode())
-    write_whole(folder / SEQUENCE_ANNOTATIONS, _jgz(sequences))
-    write_whole(folder / FRAME_ANNOTATIONS, _jgz(frames))
+    write_atomic(folder / "set_lists" / f"set_lists_{set_list}.json", json.dumps(subsets).encode())
+    write_atomic(folder / SEQUENCE_ANNOTATIONS, _jgz(sequences))
+    write_atomic(folder / FRAME_ANNOTATIONS, _jgz(frames))
 
 
 def _write_depth(root: Path, folder: str, stem: str, depth: Float[Tensor, "h w"]) -> dict[str, Any]:
@@ -105,14 +105,14 @@ def _write_depth(root: Path, folder: str, stem: str, depth: Float[Tensor, "h w"]
         raise ValueError("depth must be finite, not negative and within the range of float16")
     path = f"{folder}/depths/{stem}.jpg.geometric.png"
     mask_path = f"{folder}/depth_masks/{stem}.png"
-    write_whole(root / path, _png(Image.fromarray(half.numpy().view(np.uint16))))
-    write_whole(root / mask_path, _png(Image.fromarray((half > 0).numpy())))
+    write_atomic(root / path, _png(Image.fromarray(half.numpy().view(np.uint16))))
+    write_atomic(root / mask_path, _png(Image.fromarray((half > 0).numpy())))
     return {"path": path, "scale_adjustment": 1.0, "mask_path": mask_path}
 
 
 def _write_mask(root: Path, folder: str, stem: str, mask: Float[Tensor, "h w"]) -> dict[str, Any]:
     path = f"{folder}/masks/{stem}.png"
-    write_whole(root / path, _png(Image.fromarray(to_eight_bits(mask))))
+    write_atomic(root / path, _png(Image.fromarray(to_eight_bits(mask))))
     return {"path": path, "mass": float(mask.sum())}
 
 

@@ -7,7 +7,7 @@ import torch
 from extrap_train.data.colmap_binary import read_binary_cameras, read_binary_images
 from extrap_train.data.colmap_records import ModelCamera, ModelImage
 from extrap_train.data.colmap_text import read_text_cameras, read_text_images
-from extrap_train.data.files import check_relative
+from extrap_train.data.paths import check_relative
 from extrap_train.data.photographs import Photograph, present_pictures, sequence_of_photographs
 from extrap_train.data.sequences import PointCloud, Sequence
 from extrap_train.errors import InputError

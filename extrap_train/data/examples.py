@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrap_train.data.store import PreparedData
+from extrap_train.data.prepared import PreparedData
 from extrap_train.errors import InputError
 from extrap_train.geometry.viewpoints import extra_references, pairwise_angles, scene_center
 from extrap_train.views import Camera, PairBatch, ViewPair, stack_cameras

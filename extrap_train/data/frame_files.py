@@ -15,7 +15,8 @@ import torch
 from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
-from extrap_train.data.files import file_stamp, save_array, whole_folder
+from extrap_train.data.paths import file_stamp
+from extrap_train.store.atomic import atomic_folder, save_array
 from extrap_train.views import Camera
 
 FLOWS = "flows.npy"
@@ -105,7 +106,7 @@ def write_frames(folder: Path, frames: SequenceFrames, key: str) -> None:
     scale = _depth_scale(frames.depths)
     scaled = frames.depths / scale
     scaled[scaled > np.finfo(np.float16).max] = 0
-    with whole_folder(folder, lambda there: is_sealed(there / CAMERAS, key)) as made:
+    with atomic_folder(folder, lambda there: is_sealed(there / CAMERAS, key)) as made:
         arrays = {IMAGES: frames.images, DEPTHS: scaled.astype(np.float16), MASKS: frames.masks}
         write_sealed(_camera_table(frames, scale), made / CAMERAS, key, arrays)
 

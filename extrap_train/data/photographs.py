@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrap_train.data.files import resolve_inside
 from extrap_train.data.images import known_depth, read_image, read_mask, read_sixteen_bit
+from extrap_train.data.paths import resolve_inside
 from extrap_train.data.sequences import Frame, PointCloud, Sequence
 from extrap_train.data.validation import degenerate_camera, require_sound
 from extrap_train.errors import InputError

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrap_train.data.files import check_relative, resolve_inside
 from extrap_train.data.images import image_size
 from extrap_train.data.json_files import read_json
+from extrap_train.data.paths import check_relative, resolve_inside
 from extrap_train.data.photographs import (
     Photograph,
     pinhole_camera,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from extrap_train.data.files import resolve_inside
+from extrap_train.data.paths import resolve_inside
 from extrap_train.views import Camera, View
 
 

@@ -12,11 +12,11 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 
 from extrap_train.config import TrainerConfig
-from extrap_train.data.files import write_whole
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.power_average import Profile, decay_at, exponent_of, mixture
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.errors import InputError
+from extrap_train.store.atomic import write_atomic
 
 TRACKED_WIDTHS = (0.05, 0.1)
 """Relative widths of the averages that are kept (Karras et al. 2024)."""
@@ -71,7 +71,7 @@ class PowerAverages(Callback):
             for width, means in self.averages.items()
             for name, mean in means.items()
         }
-        write_whole(self.folder / f"step-{trainer.global_step:08d}.safetensors", save(tensors))
+        write_atomic(self.folder / f"step-{trainer.global_step:08d}.safetensors", save(tensors))
         found = {_step_of(file): file for file in _snapshots(self.folder)}
         for step in found.keys() - set(thinned(list(found), self.every)):
             found[step].unlink()

@@ -28,8 +28,8 @@ from rich.progress import (
 )
 from torch import Tensor
 
-from extrap_train.data.files import partial_beside, replace_whole, write_whole
 from extrap_train.errors import InputError
+from extrap_train.store.atomic import partial_path, replace_synced, write_atomic
 
 _KEPT = 2
 
@@ -42,11 +42,11 @@ class WholeCheckpointIO(TorchCheckpointIO):
     ) -> None:
         """Write under a temporary name, then rename what has reached the disk."""
         path = Path(path)
-        temporary = partial_beside(path)
+        temporary = partial_path(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             torch.save(checkpoint, temporary)  # not by way of memory: it is 14 GB at full size
-            replace_whole(temporary, path)
+            replace_synced(temporary, path)
         except (OSError, RuntimeError) as error:
             reason = str(error).splitlines()[0]
             raise InputError(
@@ -166,7 +166,7 @@ class MetricsTable(Logger):
         writer = csv.DictWriter(text, columns, restval="")
         writer.writeheader()
         writer.writerows(self._rows)
-        write_whole(self.path, text.getvalue().encode())
+        write_atomic(self.path, text.getvalue().encode())
 
 
 def _read(path: Path) -> list[dict[str, str]]:

@@ -16,7 +16,6 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from extrap_train.config import ModelConfig, dotted, validate_model
-from extrap_train.data.files import partial_beside, write_whole
 from extrap_train.diffusion.autoencoder import PixelPatches
 from extrap_train.diffusion.compact import compress, restore
 from extrap_train.diffusion.model import ExtrapolationModel
@@ -25,6 +24,7 @@ from extrap_train.diffusion.published.meaning import SCHEDULER, require_same_mea
 from extrap_train.diffusion.published.read import SOURCES, Shapes, read_published, weights_at
 from extrap_train.diffusion.transfer import narrowed, turned_pose, widened
 from extrap_train.errors import InputError
+from extrap_train.store.atomic import partial_path, write_atomic
 from extrap_train.weight_files import WeightFile
 
 _PUBLISHED_CHANNELS = {8: "zeronvs", 11: "megascenes"}
@@ -43,7 +43,7 @@ def save_model(model: ExtrapolationModel, folder: Path, dtype: torch.dtype = tor
 
     The folder appears complete or not at all; an older one of that name is replaced.
     """
-    temporary = partial_beside(folder)
+    temporary = partial_path(folder)
     shutil.rmtree(temporary, ignore_errors=True)
     try:
         _write_config(model, temporary)
@@ -72,7 +72,7 @@ def save_compact(model: ExtrapolationModel, folder: Path, base: str = "base") ->
     """
     start = packaged_weights(base)
     tensors = compress(_state(model), _state(load_model(start)))
-    temporary = partial_beside(folder)
+    temporary = partial_path(folder)
     shutil.rmtree(temporary, ignore_errors=True)
     try:
         _write_config(model, temporary)
@@ -125,7 +125,9 @@ def _digest(folder: Path) -> str:
 
 
 def _write_config(model: ExtrapolationModel, folder: Path) -> None:
-    write_whole(folder / MODEL_CONFIG, (json.dumps(asdict(model.config), indent=1) + "\n").encode())
+    write_atomic(
+        folder / MODEL_CONFIG, (json.dumps(asdict(model.config), indent=1) + "\n").encode()
+    )
 
 
 def _save(tensors: dict[str, Tensor], path: Path, about: Mapping[str, str] | None = None) -> None:

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from plyfile import PlyData, PlyElement
 
-from extrap_train.data.files import write_whole
 from extrap_train.data.images import to_eight_bits
 from extrap_train.geometry.colmap import colmap_from_world_to_cam
 from extrap_train.geometry.opengl import opengl_from_world_to_cam
@@ -17,6 +16,7 @@ from extrap_train.pictures import picture
 from extrap_train.reconstruction.cloud import PointCloud
 from extrap_train.reconstruction.global_map import GlobalMap, MapView
 from extrap_train.reconstruction.inputs import WorldUnit
+from extrap_train.store.atomic import write_atomic
 from extrap_train.views import Camera
 
 MOST_COLMAP_POINTS = 50_000
@@ -33,7 +33,7 @@ def write_cloud(cloud: PointCloud, path: Path) -> None:
         rows[name] = column
     content = io.BytesIO()
     PlyData([PlyElement.describe(rows, "vertex")]).write(content)
-    write_whole(path, content.getvalue())
+    write_atomic(path, content.getvalue())
 
 
 def write_views(known: GlobalMap, unit: WorldUnit, folder: Path) -> None:
@@ -46,7 +46,7 @@ def write_views(known: GlobalMap, unit: WorldUnit, folder: Path) -> None:
         _write_array(view.confidence, folder / "views" / f"{stem}.confidence.npy")
         entries.append(_entry(view, stem, unit.outside(view.camera)))
     content = {"camera_model": "PINHOLE", "ply_file_path": "cloud.ply", "frames": entries}
-    write_whole(folder / "transforms.json", (json.dumps(content, indent=1) + "\n").encode())
+    write_atomic(folder / "transforms.json", (json.dumps(content, indent=1) + "\n").encode())
 
 
 def write_colmap(known: GlobalMap, unit: WorldUnit, cloud: PointCloud, folder: Path) -> None:
@@ -106,8 +106,8 @@ def _entry(view: MapView, stem: str, camera: Camera) -> dict[str, object]:
 def _write_array(values: torch.Tensor, path: Path) -> None:
     content = io.BytesIO()
     np.save(content, values.numpy().astype(np.float32))
-    write_whole(path, content.getvalue())
+    write_atomic(path, content.getvalue())
 
 
 def _write_lines(path: Path, lines: Sequence[str]) -> None:
-    write_whole(path, ("\n".join(lines) + "\n").encode())
+    write_atomic(path, ("\n".join(lines) + "\n").encode())

@@ -11,13 +11,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrap_train.data.files import write_whole
 from extrap_train.geometry.splat import splat
 from extrap_train.geometry.viewpoints import camera_centers, scene_center
 from extrap_train.pictures import contact_sheet, film
 from extrap_train.reconstruction.cloud import PointCloud
 from extrap_train.reconstruction.global_map import GIVEN, GlobalMap
 from extrap_train.reconstruction.planner import Query, circle_cameras, fit_circle
+from extrap_train.store.atomic import write_atomic
 from extrap_train.views import Camera, stack_cameras
 
 PICTURE_SIZE = 192
@@ -99,7 +99,7 @@ def draw_plan(known: GlobalMap, queries: Sequence[Query], path: Path) -> None:
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=100)
     plt.close(figure)
-    write_whole(path, content.getvalue())
+    write_atomic(path, content.getvalue())
 
 
 def _turn(known: GlobalMap, count: int) -> Camera:

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from extrap_train.data.files import write_whole
 from extrap_train.errors import InputError
 from extrap_train.reconstruction.completion import Step
 from extrap_train.reconstruction.global_map import GlobalMap, MapView, Origin
+from extrap_train.store.atomic import write_atomic
 from extrap_train.views import Camera, View
 
 
@@ -34,12 +34,12 @@ def save_view(view: MapView, folder: Path, index: int) -> None:
         intrinsics=view.camera.intrinsics.numpy(),
         record=np.array(json.dumps({"name": view.view.name, **asdict(view.origin)})),
     )
-    write_whole(view_file(folder, index), content.getvalue())
+    write_atomic(view_file(folder, index), content.getvalue())
 
 
 def save_step(step: Step, folder: Path, index: int) -> None:
     """Write how the view with this index came about; goes before the view itself."""
-    write_whole(_step_file(folder, index), (json.dumps(asdict(step)) + "\n").encode())
+    write_atomic(_step_file(folder, index), (json.dumps(asdict(step)) + "\n").encode())
 
 
 def load_steps(folder: Path, count: int) -> list[Step]:

@@ -14,9 +14,8 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from extrap_train.config import TrainConfig, placed
-from extrap_train.data.files import held_alone
 from extrap_train.data.module import PairModule
-from extrap_train.data.store import PreparedData
+from extrap_train.data.prepared import PreparedData
 from extrap_train.device import require_accelerator
 from extrap_train.diffusion.averages import PowerAverages, snapshot_bytes
 from extrap_train.diffusion.callbacks import (
@@ -42,6 +41,7 @@ from extrap_train.runs import (
     require_same_options,
     run_folder,
 )
+from extrap_train.store.atomic import file_lock
 from extrap_train.tasks.results import Finished, Results, draw_curve, draw_views, write_results
 from extrap_train.tasks.seen_before import require_unseen
 from extrap_train.tasks.training_data import data_module, prepared_data, validation_names
@@ -94,7 +94,7 @@ def _opened(folder: RunFolder, config: TrainConfig, trained_on: TrainedOn) -> It
         yield join(folder.path)
         return
     taken = f"{folder.path}: another process is training this run; wait for it or give run=NAME"
-    with held_alone(folder.lock, taken):
+    with file_lock(folder.lock, taken):
         open_run(config, trained_on)
         point_latest(folder)
         newest = checkpoints(folder.checkpoints)[-1:]

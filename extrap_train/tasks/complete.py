@@ -22,7 +22,6 @@ from extrap_train.config import (
     dotted,
     sampler_for,
 )
-from extrap_train.data.files import held_alone, write_whole
 from extrap_train.data.photographs import CATEGORY
 from extrap_train.data.scene import SYNTHETIC_SCHEME, open_scene
 from extrap_train.data.sequences import Sequence
@@ -48,6 +47,7 @@ from extrap_train.reconstruction.planner import Query, expected_order, orbit_que
 from extrap_train.reconstruction.pose_check import check_poses
 from extrap_train.reconstruction.viewer import CloudViewer
 from extrap_train.runs import newest_run
+from extrap_train.store.atomic import file_lock, write_atomic
 from extrap_train.tasks.completed import Completed, write_completed
 from extrap_train.tasks.scene_folder import require_same, result_folder
 from extrap_train.tasks.scene_inputs import device_of, required_scene, trained_model
@@ -84,7 +84,7 @@ def run(config: TrainConfig) -> Path:
     console = terminal()
     job.folder.mkdir(parents=True, exist_ok=True)
     taken = f"{job.folder}: another process is completing this scene; wait for it or give run=NAME"
-    with held_alone(job.folder / ".lock", taken):
+    with file_lock(job.folder / ".lock", taken):
         _run(job, console)
     return job.folder
 
@@ -216,7 +216,7 @@ def _note_options(record: Path, options: dict[str, Any]) -> None:
     if record.is_file():
         require_same(record, options, "start over")
     else:
-        write_whole(record, (json.dumps(options, indent=1) + "\n").encode())
+        write_atomic(record, (json.dumps(options, indent=1) + "\n").encode())
 
 
 def _queries(job: _Job, known: GlobalMap) -> list[Query]:

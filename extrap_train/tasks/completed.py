@@ -15,7 +15,6 @@ from rich.table import Table
 
 from benchmarks.methods.gaussians.trainer import Diverged
 from extrap_train.config import TrainConfig
-from extrap_train.data.files import write_whole
 from extrap_train.data.sequences import Frame, Sequence
 from extrap_train.data.synthetic import SyntheticScene
 from extrap_train.errors import InputError
@@ -36,6 +35,7 @@ from extrap_train.reconstruction.report import (
     view_consistency,
 )
 from extrap_train.runs import provenance
+from extrap_train.store.atomic import write_atomic
 from extrap_train.tasks.scene_inputs import learnt_frames
 from extrap_train.tasks.splats import write_fitted_splats
 from extrap_train.views import Camera, stack_cameras
@@ -99,7 +99,7 @@ def write_completed(
         "steps": step_records(done.steps),
         "provenance": provenance(config, {"scene": config.scene or ""}),
     }
-    write_whole(folder / "summary.json", (json.dumps(summary, indent=1) + "\n").encode())
+    write_atomic(folder / "summary.json", (json.dumps(summary, indent=1) + "\n").encode())
     _print(summary, console)
     console.print(f"pictures: {folder / 'growth.png'}\nresult: {folder}")
 

@@ -7,7 +7,7 @@ from typing import Any, cast
 import lightning
 
 from extrap_train.config import TrainConfig
-from extrap_train.data.store import PreparedData
+from extrap_train.data.prepared import PreparedData
 from extrap_train.device import require_accelerator
 from extrap_train.diffusion.checkpoint import saved_config
 from extrap_train.diffusion.layout import arranged

@@ -12,11 +12,11 @@ from rich.console import Console
 from rich.table import Table
 
 from extrap_train.config import TrainConfig
-from extrap_train.data.files import write_whole
 from extrap_train.diffusion.evaluation import Prediction, summarise
 from extrap_train.errors import InputError
 from extrap_train.pictures import contact_sheet, curve, error_map, mark_holes
 from extrap_train.runs import RunFolder
+from extrap_train.store.atomic import write_atomic
 
 _ABOVE = "validation/above_baselines_db"
 
@@ -74,7 +74,7 @@ def write_results(
     validation = summarise(results.scores)
     text = io.StringIO()
     results.scores.to_csv(text, index=False)
-    write_whole(folder.path / "validation.csv", text.getvalue().encode())
+    write_atomic(folder.path / "validation.csv", text.getvalue().encode())
     draw_views(results.shown, folder.samples / "final.png")
     summary = {
         "validation": validation,
@@ -84,7 +84,7 @@ def write_results(
         "parameters": results.parameters,
         "provenance": {**results.provenance, "validation": asdict(config.validation)},
     }
-    write_whole(folder.summary, (json.dumps(without_nan(summary), indent=1) + "\n").encode())
+    write_atomic(folder.summary, (json.dumps(without_nan(summary), indent=1) + "\n").encode())
     console.print(_table(validation))
     for name, reason in results.missing.items():
         console.print(f"missing {name}: {reason}")

@@ -15,7 +15,6 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from data_prep.views import target_views
 from extrap_train.config import SamplerConfig, TrainConfig, dotted, sampler_for
-from extrap_train.data.files import write_whole
 from extrap_train.data.module import spread
 from extrap_train.data.scene import scene_address
 from extrap_train.data.scene_pairs import AdaptationPairs, adaptation_pairs
@@ -30,6 +29,7 @@ from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError
 from extrap_train.metrics import Distance, lpips_or_reason
 from extrap_train.pictures import contact_sheet, curve, error_map, mark_holes
+from extrap_train.store.atomic import write_atomic
 from extrap_train.tasks.results import without_nan
 from extrap_train.tasks.scene_folder import claimed, result_folder, scene_options, whole_result
 from extrap_train.tasks.scene_inputs import (
@@ -209,7 +209,7 @@ def _measure(
     scores = score_images(images, truth, after.warp.mask, names, distance)
     text = io.StringIO()
     scores.to_csv(text, index=False)
-    write_whole(folder / "held_out.csv", text.getvalue().encode())
+    write_atomic(folder / "held_out.csv", text.getvalue().encode())
     contact_sheet(
         {
             "warp": mark_holes(after.warp.image, after.warp.mask),
@@ -240,7 +240,7 @@ def _write(
         "missing": missing if measured else {"held_out": "every frame of the scene is an input"},
     }
     content = json.dumps(without_nan(summary), indent=1) + "\n"
-    write_whole(folder / "summary.json", content.encode())
+    write_atomic(folder / "summary.json", content.encode())
 
 
 def _said(done: Adaptation, measured: dict[str, dict[str, float]]) -> str:

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from extrap_train.config import SyntheticConfig, TrainConfig, dotted
-from extrap_train.data.files import held_alone, remove_partial, whole_folder, write_whole
 from extrap_train.data.scene import SYNTHETIC_SCHEME, scene_address
 from extrap_train.errors import InputError
 from extrap_train.runs import given_name
+from extrap_train.store.atomic import atomic_folder, file_lock, remove_leftovers, write_atomic
 from extrap_train.tasks.scene_inputs import named_weights, required_scene
 
 MADE_WITH = "made_with.json"
@@ -54,10 +54,10 @@ def claimed(folder: Path, options: dict[str, Any], *, resume: bool) -> Iterator[
     folder.parent.mkdir(parents=True, exist_ok=True)
     taken = f"{folder}: another process is making this; wait for it or give run=NAME"
     try:
-        with held_alone(folder.with_name(f".{folder.name}.lock"), taken):
+        with file_lock(folder.with_name(f".{folder.name}.lock"), taken):
             if resume and folder.exists():
                 require_same(folder / MADE_WITH, options, "replace it")
-            remove_partial(folder.parent)
+            remove_leftovers(folder.parent)
             yield
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
@@ -68,9 +68,9 @@ def claimed(folder: Path, options: dict[str, Any], *, resume: bool) -> Iterator[
 @contextmanager
 def whole_result(folder: Path, options: dict[str, Any]) -> Iterator[Path]:
     """A folder to write a result into, which takes the place of the older one at the end."""
-    with whole_folder(folder, lambda _: False) as made:
+    with atomic_folder(folder, lambda _: False) as made:
         yield made
-        write_whole(made / MADE_WITH, (json.dumps(options, indent=1) + "\n").encode())
+        write_atomic(made / MADE_WITH, (json.dumps(options, indent=1) + "\n").encode())
 
 
 def require_same(record: Path, options: dict[str, Any], otherwise: str) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 from extrap_train.config import TrainConfig
 from extrap_train.data.examples import ExampleReader
 from extrap_train.data.module import PairModule
-from extrap_train.data.store import PreparedData
+from extrap_train.data.prepared import PreparedData
 from extrap_train.errors import InputError
 from extrap_train.tasks.prepare import check_members, prepare_category
 

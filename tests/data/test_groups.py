@@ -9,7 +9,7 @@ from data_prep.build import prepare
 from extrap_train.config import PrepConfig
 from extrap_train.data.examples import Example, ExampleReader
 from extrap_train.data.module import PairModule, TrainingBatches
-from extrap_train.data.store import PreparedData
+from extrap_train.data.prepared import PreparedData
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError
 

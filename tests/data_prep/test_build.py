@@ -18,7 +18,7 @@ from data_prep.tools import Tools
 from data_prep.unit import Unit, Workshop, prepare_unit
 from extrap_train.config import FlowMatcherConfig, PrepConfig
 from extrap_train.data import frame_files
-from extrap_train.data.store import PreparedData
+from extrap_train.data.prepared import PreparedData
 from extrap_train.depth import DepthMap, DepthSource
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError

@@ -14,7 +14,7 @@ from torch.nn import functional
 from data_prep import correct
 from data_prep.correct import Correction, correct_pair
 from extrap_train.config import Co3dConfig, FlowMatcherConfig, PrepConfig, StereoConfig
-from extrap_train.data.store import PreparedData
+from extrap_train.data.prepared import PreparedData
 from extrap_train.matching.build import matcher
 from extrap_train.tasks.prepare import prepare_category
 

@@ -21,7 +21,7 @@ from extrap_train.config import FlowMatcherConfig, SyntheticConfig, TrainConfig
 from extrap_train.data.co3d import read_category
 from extrap_train.data.examples import ExampleReader
 from extrap_train.data.module import PairModule
-from extrap_train.data.store import PreparedData
+from extrap_train.data.prepared import PreparedData
 from extrap_train.depth import DepthMap
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.diffusion.callbacks import AveragedWeights

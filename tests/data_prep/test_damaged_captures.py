@@ -22,7 +22,7 @@ from extrap_train.config import (
     PrepConfig,
     StereoConfig,
 )
-from extrap_train.data.store import PreparedData
+from extrap_train.data.prepared import PreparedData
 from extrap_train.depth import DepthMap
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError

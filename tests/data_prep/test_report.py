@@ -13,7 +13,7 @@ from data_prep.build import prepare
 from data_prep.report import coverage, write_report
 from data_prep.report_pairs import correction_facts, error_histogram, pair_sheet
 from extrap_train.config import FlowMatcherConfig, PrepConfig
-from extrap_train.data.store import Pairs, PreparedData
+from extrap_train.data.prepared import Pairs, PreparedData
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.matching.flow import FlowMatcher
 

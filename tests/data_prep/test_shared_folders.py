@@ -19,8 +19,8 @@ from extrap_train.config import (
     placed,
 )
 from extrap_train.data.frame_files import frames_folder, pairs_folder
+from extrap_train.data.prepared import PreparedData
 from extrap_train.data.sequences import Sequence
-from extrap_train.data.store import PreparedData
 from extrap_train.tasks.prepare import prepare_category
 
 OPTIONS = PrepConfig(image_size=16)

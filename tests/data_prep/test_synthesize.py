@@ -14,10 +14,10 @@ from data_prep.gallery import gallery
 from data_prep.synthesize import synthesize
 from extrap_train.config import SyntheticConfig
 from extrap_train.data.co3d import read_category
-from extrap_train.data.files import partial_beside
 from extrap_train.data.synthetic import build_scene, handheld_orbit, render, walk_seed
 from extrap_train.errors import InputError
 from extrap_train.jobs.local import LocalLauncher
+from extrap_train.store.atomic import partial_path
 
 SMALL = SyntheticConfig(test_sequences=1, train_sequences=2, frames=3, image_size=16)
 
@@ -120,7 +120,7 @@ def test_a_download_that_was_unpacked_over_synthetic_captures_is_left_as_it_is(r
 
 
 def test_half_of_a_rendering_is_removed_but_not_a_living_ones(root):
-    half = partial_beside(root / "apple" / "0000")
+    half = partial_path(root / "apple" / "0000")
     (half / "apple" / "0000").mkdir(parents=True)
     living = half.with_name(half.name.replace(f"-{os.getpid()}.", f"-{os.getppid()}."))
     living.mkdir()

@@ -26,8 +26,8 @@ from extrap_train.config import (
     PrepConfig,
     SyntheticConfig,
 )
+from extrap_train.data.prepared import PreparedData
 from extrap_train.data.sequences import Sequence
-from extrap_train.data.store import PreparedData
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.depth.mast3r.network import Architecture, PointMapNetwork
 from extrap_train.errors import InputError

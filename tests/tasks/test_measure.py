@@ -16,7 +16,7 @@ from extrap_train.config import (
     ModelConfig,
     TrainConfig,
 )
-from extrap_train.data.store import PreparedData
+from extrap_train.data.prepared import PreparedData
 from extrap_train.errors import InputError
 from extrap_train.runs import RunFolder
 from extrap_train.tasks import average, validate

@@ -15,8 +15,8 @@ from plyfile import PlyData, PlyElement, PlyParseError
 from torch.nn import functional
 
 from benchmarks.methods.gaussians.gaussians import Gaussians
-from extrap_train.data.files import write_whole
 from extrap_train.errors import InputError
+from extrap_train.store.atomic import write_atomic
 
 _LEAST = 1e-6
 """Opacities are kept this far from 0 and 1, and scales above it, whose logits are infinite."""
@@ -41,7 +41,7 @@ def write_splats(path: Path, gaussians: Gaussians, comments: Sequence[str] = ())
     content = io.BytesIO()
     elements = [PlyElement.describe(vertices, "vertex")]
     PlyData(elements, byte_order="<", comments=list(comments)).write(content)
-    write_whole(path, content.getvalue())
+    write_atomic(path, content.getvalue())
 
 
 def read_splats(path: Path) -> Gaussians:

@@ -1,4 +1,4 @@
-"""Files from outside, read with care, and files of ours, written whole or not at all."""
+"""Files and folders that are written complete or not at all, and the locks around them."""
 
 import os
 import re
@@ -16,82 +16,23 @@ from jaxtyping import Shaped
 
 from extrap_train.errors import InputError
 
-MAX_NAME_BYTES = 255
-"""Of a file or folder, on every common file system."""
 _WRITER = re.compile(r"\.(?P<host>[^.]+)-(?P<pid>\d+)(\.[^.]+)?\.tmp$")
 _ABANDONED_S = 24 * 3600.0
 
-# Absolute, on a Windows drive, with a `..` among its parts, or with a NUL that would end it early.
-_LEAVES_FOLDER = re.compile(r"^[/\\]|^[A-Za-z]:|(^|[/\\])\.\.([/\\]|$)|\0")
 
-
-def check_relative(relative: str, file: Path) -> str:
-    """`relative` unchanged, if its text cannot lead out of a folder and a file may be called so.
-
-    `file` is where it stood.
-    """
-    if not relative or _LEAVES_FOLDER.search(relative):
-        raise InputError(
-            f"{file}: the path {relative!r} is absolute, empty or climbs out of its folder; "
-            "only paths below the data set's root can be read: correct the entry"
-        )
-    try:
-        longest = max(map(len, os.fsencode(relative).split(b"/")))
-    except UnicodeEncodeError:
-        raise InputError(
-            f"{file}: the path {relative!a} is no Unicode; correct the entry"
-        ) from None
-    if longest > MAX_NAME_BYTES:
-        raise InputError(f"{file}: the path {relative[:60]!r}… has too long a name; correct it")
-    return relative
-
-
-def resolve_inside(root: Path, relative: str) -> Path:
-    """The real path of an existing file below `root`, symbolic links followed.
-
-    Raises InputError where it is missing or where a link leads out of `root`.
-    """
-    path = root / relative
-    try:
-        resolved = path.resolve()
-        exists = resolved.is_file()
-    except (OSError, RuntimeError, ValueError) as error:  # too long, or a loop of links
-        reason = str(error).split(":")[0]
-        raise InputError(f"{path}: no file can be there ({reason}); correct the entry") from None
-    if not resolved.is_relative_to(root.resolve()):
-        raise InputError(
-            f"{path}: leads out of {root} to {resolved}; copy the file into the data set instead"
-        )
-    if not exists:
-        raise InputError(f"{path}: no such file; restore it or remove its entry")
-    return resolved
-
-
-def file_stamp(path: Path) -> tuple[int, int] | None:
-    """Size in bytes and time of the last change in nanoseconds; None where there is no such file.
-
-    What says, without reading it, that a file is another one now.
-    """
-    try:
-        found = path.stat()
-    except (OSError, ValueError):
-        return None
-    return found.st_size, found.st_mtime_ns
-
-
-def partial_beside(path: Path) -> Path:
-    """Where this process writes what is to become `path`; says whose it is (`remove_partial`)."""
+def partial_path(path: Path) -> Path:
+    """Where this process writes what is to become `path`; says whose it is (`remove_leftovers`)."""
     return path.with_name(f".{path.name}.{_host()}-{os.getpid()}.tmp")
 
 
-def write_whole(path: Path, content: bytes) -> None:
+def write_atomic(path: Path, content: bytes) -> None:
     """Write a file so that it is there complete or not at all; makes the folders above it."""
-    temporary = partial_beside(path)
+    temporary = partial_path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             temporary.write_bytes(content)
-            replace_whole(temporary, path)
+            replace_synced(temporary, path)
         finally:
             temporary.unlink(missing_ok=True)
     except OSError as error:
@@ -100,7 +41,7 @@ def write_whole(path: Path, content: bytes) -> None:
         ) from None
 
 
-def replace_whole(made: Path, path: Path) -> None:
+def replace_synced(made: Path, path: Path) -> None:
     """Let a file that is complete become `path`, on the same file system, once it is on the disk.
 
     Renamed before, it could be there after a power cut with nothing in it.
@@ -124,21 +65,21 @@ def save_array(path: Path, array: Shaped[np.ndarray, "..."]) -> int:
 
 
 @contextmanager
-def whole_folder(folder: Path, is_wanted: Callable[[Path], bool]) -> Iterator[Path]:
-    """A folder to write into, which `put_in_place` at the end, or of which nothing stays behind."""
+def atomic_folder(folder: Path, is_wanted: Callable[[Path], bool]) -> Iterator[Path]:
+    """A new folder that `install_folder` puts in place at the end, or of which nothing remains."""
     folder.parent.mkdir(parents=True, exist_ok=True)
-    own = partial_beside(folder)
+    own = partial_path(folder)
     made = Path(tempfile.mkdtemp(prefix=f"{own.stem}.", suffix=own.suffix, dir=folder.parent))
     try:
         yield made
         made.chmod(0o755)  # mkdtemp's folders are closed to everyone else
-        put_in_place(made, folder, is_wanted)
+        install_folder(made, folder, is_wanted)
     finally:
         shutil.rmtree(made, ignore_errors=True)
 
 
 @contextmanager
-def held_alone(lock: Path, otherwise: str) -> Iterator[None]:
+def file_lock(lock: Path, otherwise: str) -> Iterator[None]:
     """What `lock` stands for, for this process alone as long as the block lasts.
 
     Raises InputError, which says `otherwise`, where another process holds it.
@@ -151,7 +92,7 @@ def held_alone(lock: Path, otherwise: str) -> Iterator[None]:
         yield
 
 
-def put_in_place(made: Path, folder: Path, is_wanted: Callable[[Path], bool]) -> None:
+def install_folder(made: Path, folder: Path, is_wanted: Callable[[Path], bool]) -> None:
     """Let what was `made` become `folder`, on the same file system, once it is on the disk.
 
     What lay there is replaced, unless it is what is wanted: then another writer has come first, and
@@ -163,7 +104,7 @@ def put_in_place(made: Path, folder: Path, is_wanted: Callable[[Path], bool]) ->
     with FileLock(folder.parent / ".lock"):
         if is_wanted(folder):
             return
-        replaced = partial_beside(folder.with_name(f"{folder.name}.replaced"))
+        replaced = partial_path(folder.with_name(f"{folder.name}.replaced"))
         if folder.exists():
             shutil.rmtree(replaced, ignore_errors=True)  # of an earlier process of the same number
             folder.rename(replaced)
@@ -172,7 +113,7 @@ def put_in_place(made: Path, folder: Path, is_wanted: Callable[[Path], bool]) ->
     shutil.rmtree(replaced, ignore_errors=True)
 
 
-def remove_partial(folder: Path) -> None:
+def remove_leftovers(folder: Path) -> None:
     """Remove the `.*.tmp` that killed writers have left in a folder, which need not exist.
 
     What another process that lives still writes is left alone; of one on another machine it is

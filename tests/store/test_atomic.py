@@ -9,16 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from extrap_train.data.files import (
-    check_relative,
-    partial_beside,
-    remove_partial,
-    resolve_inside,
-    save_array,
-    whole_folder,
-    write_whole,
-)
+from extrap_train.data.paths import check_relative, resolve_inside
 from extrap_train.errors import InputError
+from extrap_train.store.atomic import (
+    atomic_folder,
+    partial_path,
+    remove_leftovers,
+    save_array,
+    write_atomic,
+)
 
 
 @pytest.mark.parametrize("path", ["a.jpg", "a/b.jpg", "a..b/..c", "...", "a b/ü.png"])
@@ -67,15 +66,15 @@ def test_a_root_behind_a_link_is_the_users_choice(tmp_path):
 
 def test_writing_makes_folders_and_replaces(tmp_path):
     file = tmp_path / "deep" / "down" / "file.txt"
-    write_whole(file, b"first")
-    write_whole(file, b"second")
+    write_atomic(file, b"first")
+    write_atomic(file, b"second")
     assert file.read_bytes() == b"second"
     assert list(file.parent.iterdir()) == [file]
 
 
 def test_a_full_disk_leaves_the_old_file_and_says_so(tmp_path, monkeypatch):
     file = tmp_path / "file.txt"
-    write_whole(file, b"old")
+    write_atomic(file, b"old")
 
     def write_half(path, content):
         with path.open("wb") as stream:
@@ -84,13 +83,13 @@ def test_a_full_disk_leaves_the_old_file_and_says_so(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Path, "write_bytes", write_half)
     with pytest.raises(InputError, match=r"cannot be written \(No space left on device\); free"):
-        write_whole(file, b"newer")
+        write_atomic(file, b"newer")
     assert file.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [file]
 
 
 def write_number(folder: Path, number: int, is_wanted=lambda there: False) -> None:
-    with whole_folder(folder, is_wanted) as made:
+    with atomic_folder(folder, is_wanted) as made:
         (made / "number").write_text(str(number))
 
 
@@ -126,7 +125,7 @@ def test_a_folder_that_is_being_replaced_is_never_half_there(tmp_path, monkeypat
     seen = {path.name: path.read_text() for path in folder.iterdir()}
     assert seen in ({"number": "1", "more": ""}, {"number": "2"})
     monkeypatch.undo()
-    remove_partial(tmp_path)
+    remove_leftovers(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"one", ".lock"}
 
 
@@ -161,16 +160,16 @@ def test_only_what_nobody_writes_any_more_is_removed(tmp_path):
     living = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
-    own = partial_beside(tmp_path / "own").name
+    own = partial_path(tmp_path / "own").name
     name = {who: own.replace(f"-{os.getpid()}.", f"-{who}.") for who in (living.pid, dead.pid)}
     elsewhere, long_ago = ".one.other_host-7.abc.tmp", ".two.other_host-7.abc.tmp"
     for folder in (own, *name.values(), elsewhere, long_ago, ".from_before.tmp"):
         (tmp_path / folder).mkdir()
     os.utime(tmp_path / long_ago, (0, 0))
-    remove_partial(tmp_path)
+    remove_leftovers(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {name[living.pid], elsewhere}
     living.communicate()
-    remove_partial(tmp_path)
+    remove_leftovers(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {elsewhere}
 
 
@@ -195,7 +194,7 @@ def test_what_vanishes_while_it_is_cleared_away_is_no_error(
         return really(path, *arguments, **options)
 
     monkeypatch.setattr(owner, step, too_late)
-    remove_partial(folder)
+    remove_leftovers(folder)
     assert {path.name for path in tmp_path.iterdir()} == {"folder", "gone"}
     assert list(folder.iterdir()) == []
 
@@ -228,5 +227,5 @@ def test_a_name_is_given_only_to_what_has_reached_the_disk(tmp_path, monkeypatch
 
     path = tmp_path / "whole"
     monkeypatch.setattr(os, "fsync", noted)
-    write_whole(path, b"content")
-    assert synced == [(partial_beside(path), False), (tmp_path, True)]
+    write_atomic(path, b"content")
+    assert synced == [(partial_path(path), False), (tmp_path, True)]

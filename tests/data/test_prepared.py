@@ -18,7 +18,7 @@ from extrap_train.data.frame_files import (
     read_camera_table,
     write_frames,
 )
-from extrap_train.data.store import PreparedData
+from extrap_train.data.prepared import PreparedData
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError
 
