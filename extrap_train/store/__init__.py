@@ -1,1 +1,1 @@
-"""What is kept on disk: atomic writes, locks and records."""
+"""Results on disk: manifests, claimed folders, atomic writes, locks, records and digests."""

@@ -2,9 +2,10 @@
 
 import os
 import re
+import secrets
 import shutil
 import socket
-import tempfile
+import stat
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -27,18 +28,8 @@ def partial_path(path: Path) -> Path:
 
 def write_atomic(path: Path, content: bytes) -> None:
     """Write a file so that it is there complete or not at all; makes the folders above it."""
-    temporary = partial_path(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            temporary.write_bytes(content)
-            replace_synced(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be written ({error.strerror}); free space or choose another folder"
-        ) from None
+    with atomic_file(path) as temporary:
+        temporary.write_bytes(content)
 
 
 def replace_synced(made: Path, path: Path) -> None:
@@ -65,14 +56,48 @@ def save_array(path: Path, array: Shaped[np.ndarray, "..."]) -> int:
 
 
 @contextmanager
-def atomic_folder(folder: Path, is_wanted: Callable[[Path], bool]) -> Iterator[Path]:
-    """A new folder that `install_folder` puts in place at the end, or of which nothing remains."""
+def atomic_file(path: Path) -> Iterator[Path]:
+    """A temporary name to write a file under, which becomes `path` at the end, or leaves no trace.
+
+    The file's mode follows the umask, whatever library writes it. Raises InputError if the disk is
+    full or closed.
+    """
+    temporary = partial_path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            temporary.touch()
+            mode = stat.S_IMODE(temporary.stat().st_mode)
+            yield temporary
+            temporary.chmod(mode)
+            replace_synced(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be written ({error.strerror or error}); free space or choose another "
+            "folder"
+        ) from None
+
+
+@contextmanager
+def atomic_folder(
+    folder: Path, is_wanted: Callable[[Path], bool] = lambda _: False
+) -> Iterator[Path]:
+    """A new folder that `install_folder` puts in place at the end, or of which nothing remains.
+
+    Modes follow the umask, whatever library writes the files.
+    """
     folder.parent.mkdir(parents=True, exist_ok=True)
     own = partial_path(folder)
-    made = Path(tempfile.mkdtemp(prefix=f"{own.stem}.", suffix=own.suffix, dir=folder.parent))
+    made = own.with_name(f"{own.stem}.{secrets.token_hex(4)}{own.suffix}")
+    made.mkdir()
+    mode = stat.S_IMODE(made.stat().st_mode)
     try:
         yield made
-        made.chmod(0o755)  # mkdtemp's folders are closed to everyone else
+        for path in made.rglob("*"):
+            if not path.is_symlink():
+                path.chmod(mode if path.is_dir() else mode & 0o666)
         install_folder(made, folder, is_wanted)
     finally:
         shutil.rmtree(made, ignore_errors=True)

@@ -1,12 +1,13 @@
 """Small JSON files that the project writes itself and reads back as dataclasses, field by field
-checked: such a file may be damaged, or somebody else's by now.
+checked: such a file may be damaged, or somebody else's by now. YAML is read as plain data.
 """
 
 import dataclasses
 import json
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
+import yaml
 from pydantic import TypeAdapter, ValidationError
 
 from extrap_train.errors import InputError
@@ -15,6 +16,7 @@ from extrap_train.store.atomic import write_atomic
 T = TypeVar("T")
 
 MAX_RECORD_BYTES = 64 * 2**20
+MAX_YAML_BYTES = 2**18
 
 
 def write_record(path: Path, record: object) -> None:
@@ -42,3 +44,34 @@ def read_record(path: Path, kind: type[T], remedy: str) -> T:
         ) from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """Refuses aliases, with which a kilobyte stands for gigabytes or contains itself."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("aliases are not allowed")
+        return super().compose_node(parent, index)
+
+
+def read_yaml(path: Path, remedy: str) -> dict[str, Any]:
+    """The mapping in a YAML file as plain values: no tags, aliases or interpolations have effect.
+
+    Raises InputError, which ends with `remedy`, for anything else, for deep nesting and for a file
+    larger than `MAX_YAML_BYTES`.
+    """
+    try:
+        if path.stat().st_size > MAX_YAML_BYTES:
+            raise InputError(f"{path}: unreadable (larger than any options file); {remedy}")
+        content = yaml.load(path.read_text(encoding="utf-8"), _PlainLoader)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
+    except RecursionError:
+        raise InputError(f"{path}: unreadable (nested too deeply); {remedy}") from None
+    except (yaml.YAMLError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path}: unreadable ({reason}); {remedy}") from None
+    if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
+        raise InputError(f"{path}: unreadable (no mapping of options); {remedy}")
+    return content

@@ -12,6 +12,7 @@ import pytest
 from extrap_train.data.paths import check_relative, resolve_inside
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import (
+    atomic_file,
     atomic_folder,
     partial_path,
     remove_leftovers,
@@ -229,3 +230,23 @@ def test_a_name_is_given_only_to_what_has_reached_the_disk(tmp_path, monkeypatch
     monkeypatch.setattr(os, "fsync", noted)
     write_atomic(path, b"content")
     assert synced == [(partial_path(path), False), (tmp_path, True)]
+
+
+@pytest.mark.parametrize(
+    ("umask", "file_mode", "folder_mode"), [(0o022, 0o644, 0o755), (0o007, 0o660, 0o770)]
+)
+def test_modes_follow_the_umask_whatever_writes(tmp_path, umask, file_mode, folder_mode):
+    before = os.umask(umask)
+    try:
+        with atomic_file(tmp_path / "weights") as file:
+            file.touch()
+            file.chmod(0o600)
+        with atomic_folder(tmp_path / "model") as folder:
+            (folder / "part").mkdir(mode=0o700)
+            (folder / "part" / "weights").touch(mode=0o600)
+            (folder / "link").symlink_to(tmp_path / "weights")
+    finally:
+        os.umask(before)
+    modes = {p.name: p.lstat().st_mode & 0o777 for p in tmp_path.rglob("*") if not p.is_symlink()}
+    assert modes["model"] == modes["part"] == folder_mode
+    assert {p.stat().st_mode & 0o777 for p in tmp_path.rglob("weights")} == {file_mode}

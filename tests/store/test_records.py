@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from extrap_train.errors import InputError
-from extrap_train.store.records import read_record, write_record
+from extrap_train.store.records import read_record, read_yaml, write_record
 
 
 @dataclass(frozen=True)
@@ -69,3 +69,32 @@ def test_numbers_that_json_has_not_are_not_written(tmp_path: Path) -> None:
     with pytest.raises(ValueError):
         write_record(tmp_path / "scene.json", _Scene("t", float("nan"), {}))
     assert not (tmp_path / "scene.json").exists()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "a: &a [x, x]\nb: [*a, *a]\n",
+        "a: &a [*a]\n",
+        "[" * 20_000,
+        "a: " + "{b: " * 5_000,
+        "a: !!python/object/apply:os.system [ls]\n",
+        "a: 1\n" * 100_000,
+        "- a\n",
+        "3: x\n",
+        "a: [",
+        "\x00",
+        "",
+    ],
+)
+def test_yaml_that_is_more_than_plain_options_is_one_line(tmp_path: Path, content: str) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text(content)
+    with pytest.raises(InputError, match=r"config\.yaml: unreadable .*; remove it"):
+        read_yaml(file, "remove it")
+
+
+def test_yaml_resolves_nothing(tmp_path: Path) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text("a: ${oc.env:HOME}\nb: {c: [1, null]}\n")
+    assert read_yaml(file, "") == {"a": "${oc.env:HOME}", "b": {"c": [1, None]}}

@@ -1,0 +1,83 @@
+"""SHA-256 of files' contents; a large file's is computed once and kept in the user's cache."""
+
+import hashlib
+import os
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from extrap_train.errors import InputError
+from extrap_train.store.records import read_record, write_record
+
+_LARGE_BYTES = 64 * 2**20
+"""Larger files are worth a record: below, hashing takes less than a tenth of a second."""
+_SETTLED_NS = 2 * 10**9
+"""A file that changed more recently may change again within one tick of its clock."""
+
+
+@dataclass(frozen=True)
+class _Known:
+    path: str
+    stamp: list[int]
+    sha256: str
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file's content.
+
+    A large file is read again only if its path, size, modification and change times or inode
+    changed. Raises InputError if it cannot be read.
+    """
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: is no file; give a file")  # a pipe would never end
+    try:
+        stamp = _stamp(path)
+        if stamp[0] < _LARGE_BYTES:
+            return _hashed(path)
+        record = _cache_folder() / f"{hashlib.sha256(os.fsencode(path.resolve())).hexdigest()}.json"
+        known = _read_known(record)
+        if known is not None and (known.path, known.stamp) == (str(path.resolve()), stamp):
+            return known.sha256
+        digest = _hashed(path)
+        settled = time.time_ns() - max(stamp[1:3]) > _SETTLED_NS
+        if settled and _stamp(path) == stamp:
+            _keep(record, _Known(str(path.resolve()), stamp, digest))
+        return digest
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+
+
+def folder_digest(folder: Path) -> str:
+    """SHA-256 of the names and contents of all files below a folder, wherever it lies."""
+    digest = hashlib.sha256()
+    for path in sorted(p for p in folder.rglob("*") if p.is_file()):
+        digest.update(f"{path.relative_to(folder).as_posix()}\0{file_digest(path)}\n".encode())
+    return digest.hexdigest()
+
+
+def _hashed(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _stamp(path: Path) -> list[int]:
+    found = path.stat()
+    return [found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino]
+
+
+def _cache_folder() -> Path:
+    given = os.environ.get("XDG_CACHE_HOME")
+    return Path(given or Path.home() / ".cache") / "extrap-train" / "digests"
+
+
+def _read_known(record: Path) -> _Known | None:
+    try:
+        return read_record(record, _Known, "")
+    except InputError:
+        return None  # none yet, or damaged: the file itself says
+
+
+def _keep(record: Path, known: _Known) -> None:
+    with suppress(InputError):  # a full or read-only home costs only time
+        write_record(record, known)

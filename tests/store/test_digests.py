@@ -1,0 +1,97 @@
+"""A digest is that of the content now, whether or not it was computed before."""
+
+import hashlib
+import os
+from pathlib import Path
+
+import pytest
+
+from extrap_train.errors import InputError
+from extrap_train.store import digests
+from extrap_train.store.digests import file_digest, folder_digest
+
+
+@pytest.fixture
+def kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Every file counts as large and settled; records go into a cache of the test's own."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(digests, "_LARGE_BYTES", 1)
+    monkeypatch.setattr(digests, "_SETTLED_NS", -1)
+    return tmp_path / "cache"
+
+
+def _sha(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def test_a_known_file_is_not_read_again(
+    kept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "weights"
+    file.write_bytes(b"one")
+    assert file_digest(file) == _sha(b"one")
+    monkeypatch.setattr(digests, "_hashed", lambda _: pytest.fail("was read again"))
+    assert file_digest(file) == _sha(b"one")
+
+
+def test_a_file_that_changed_is_read_again_even_with_its_old_time_and_size(
+    kept: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / "weights"
+    file.write_bytes(b"one")
+    before = file.stat()
+    assert file_digest(file) == _sha(b"one")
+    file.write_bytes(b"two")
+    os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert file_digest(file) == _sha(b"two")
+    other = tmp_path / "other"
+    other.write_bytes(b"six")
+    os.utime(other, ns=(before.st_atime_ns, before.st_mtime_ns))
+    other.replace(file)
+    assert file_digest(file) == _sha(b"six")
+
+
+@pytest.mark.parametrize("damage", [b"", b"[" * 20_000, b'{"path": 3}'])
+def test_a_damaged_record_costs_only_time(kept: Path, tmp_path: Path, damage: bytes) -> None:
+    file = tmp_path / "weights"
+    file.write_bytes(b"one")
+    file_digest(file)
+    for record in kept.rglob("*.json"):
+        record.write_bytes(damage)
+    assert file_digest(file) == _sha(b"one")
+
+
+def test_a_cache_that_cannot_be_written_costs_only_time(kept: Path, tmp_path: Path) -> None:
+    kept.touch()
+    file = tmp_path / "weights"
+    file.write_bytes(b"one")
+    assert file_digest(file) == _sha(b"one")
+
+
+def test_a_file_that_has_just_changed_is_not_remembered(
+    kept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(digests, "_SETTLED_NS", 10**12)
+    file = tmp_path / "weights"
+    file.write_bytes(b"one")
+    file_digest(file)
+    assert not kept.exists()
+
+
+def test_a_folder_is_its_names_and_contents(tmp_path: Path) -> None:
+    for name in ("a", "b", "c", "d"):
+        (tmp_path / name / "unet").mkdir(parents=True)
+        (tmp_path / name / "unet" / "weights").write_bytes(b"one")
+    (tmp_path / "b" / "unet" / "weights").write_bytes(b"two")
+    (tmp_path / "c" / "unet" / "weights").rename(tmp_path / "c" / "weights")
+    found = {name: folder_digest(tmp_path / name) for name in ("a", "b", "c", "d")}
+    assert found["a"] == found["d"]
+    assert len({found[name] for name in ("a", "b", "c")}) == 3
+
+
+def test_what_is_no_file_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="absent"):
+        file_digest(tmp_path / "absent")
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="pipe"):
+        file_digest(tmp_path / "pipe")

@@ -1,0 +1,76 @@
+"""Two manifests differ in what a result follows from, and in nothing else."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from extrap_train.store.manifest import Manifest, Split
+from extrap_train.store.records import read_record, write_record
+
+_SPLIT = Split("synthetic", ("0002", "0003"), ("0000", "0001"), seed=0)
+_MANIFEST = Manifest.of(
+    {"depth.name": "stereo", "inputs": (1, 2), "seed": 0},
+    {"photograph a.jpg": "aa", "weights": "bb"},
+    {"hydrant": _SPLIT},
+)
+
+
+def test_it_comes_back_equal_from_its_file(tmp_path: Path) -> None:
+    write_record(tmp_path / "manifest.json", _MANIFEST)
+    assert read_record(tmp_path / "manifest.json", Manifest, "") == _MANIFEST
+
+
+def test_versions_are_recorded_and_not_compared() -> None:
+    assert _MANIFEST.packages["torch"]
+    assert _MANIFEST.code
+    other = replace(_MANIFEST, code="9", packages={})
+    assert other.differences(_MANIFEST) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"options": {**_MANIFEST.options, "seed": 1}}, ["seed", "0", "1"]),
+        ({"options": {"seed": 0, "inputs": [1, 2]}}, ["depth.name", "stereo"]),
+        ({"options": {**_MANIFEST.options, "new": 3}}, ["new", "3"]),
+        ({"inputs": {**_MANIFEST.inputs, "weights": "cc"}}, ["weights"]),
+        ({"inputs": {"weights": "bb"}}, ["photograph a.jpg"]),
+        ({"inputs": {**_MANIFEST.inputs, "photograph b.jpg": "cc"}}, ["photograph b.jpg"]),
+        ({"split": {"hydrant": replace(_SPLIT, test=("0000",))}}, ["hydrant"]),
+        (
+            {"split": {"hydrant": replace(_SPLIT, train=("0001",), test=("0002",))}},
+            ["hydrant", "2 captures", "0001"],
+        ),
+        ({"split": {"apple": _SPLIT}}, ["apple"]),
+    ],
+)
+def test_every_change_of_content_is_named(change: dict, named: list[str]) -> None:
+    found = replace(_MANIFEST, **change).differences(_MANIFEST)
+    assert len(found) == 1
+    assert all(word in found[0] for word in named)
+
+
+def test_many_differences_are_counted() -> None:
+    other = replace(_MANIFEST, inputs={f"photograph {i}": "x" for i in range(40)})
+    found = other.differences(_MANIFEST)
+    assert len(found) < 10
+    assert "36 more" in found[-1]
+
+
+@pytest.mark.parametrize(
+    ("seen", "leaked"),
+    [
+        (Split("synthetic", ("0001", "0000", "0007"), (), 0), ["0000", "0001"]),
+        (Split("synthetic", ("0001",), (), None), ["0001"]),
+        (Split("synthetic", ("0001",), (), 1), []),
+        (Split("co3d", ("0001",), (), None), []),
+        (Split("synthetic", ("0002",), ("0001",), 0), []),
+    ],
+)
+def test_a_capture_leaks_if_it_is_held_out_here_and_trained_on_there(
+    seen: Split, leaked: list[str]
+) -> None:
+    found = _MANIFEST.leaked_from(replace(_MANIFEST, split={"hydrant": seen}))
+    assert found == ({"hydrant": leaked} if leaked else {})
+    assert _MANIFEST.leaked_from(replace(_MANIFEST, split={"apple": seen})) == {}
