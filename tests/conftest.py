@@ -1,9 +1,29 @@
-"""Fixtures that every test may use."""
+"""Fixtures that every test may use, and how the tests share the machine."""
 
+import os
 from pathlib import Path
+
+# One thread per worker, and per command that a test starts: the workers share the cores.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 import torch
+
+_MOST_WORKERS = 8  # each holds about 2 GiB
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """One worker per core for whole folders of tests.
+
+    Single files, slow tests and `-s` run in this process: starting workers costs more than it
+    saves, or takes the cores or the output away.
+    """
+    option = config.option
+    files = all(Path(argument.split("::")[0]).is_file() for argument in config.args)
+    if files or option.markexpr == "slow" or option.capture == "no":
+        return 0
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return min(cores or 1, _MOST_WORKERS)
 
 
 @pytest.fixture(scope="session")
