@@ -10,9 +10,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-from tqdm.contrib.logging import logging_redirect_tqdm
-
 from data_prep.correct import METHOD as CORRECTION_METHOD
 from data_prep.filter import judge_all
 from data_prep.frames import METHOD, CaptureKeys, too_many_unusable
@@ -30,6 +27,7 @@ from extrap_train.jobs import Died, Launcher
 from extrap_train.jobs.local import LocalLauncher
 from extrap_train.matching import Matcher
 from extrap_train.store.atomic import remove_leftovers
+from extrap_train.terminal import track
 
 LOG = logging.getLogger(__name__)
 HERE = LocalLauncher(1)
@@ -188,14 +186,12 @@ def _make_all(plan: _Plan, launcher: Launcher, progress: bool) -> tuple[list[Out
         if not units:
             return outcomes, split
         done = launcher.run(prepare_unit, units)
-        bar = tqdm(done, "preparing", len(units), unit="sequence", disable=not progress)
-        with logging_redirect_tqdm():
-            for index, reason in bar:
-                unit = units[index]
-                made[unit.name] = unit.role
-                if reason:
-                    number = kept[unit.name]
-                    outcomes[number] = _left_out(outcomes[number], reason)
+        for index, reason in track(done, "preparing", len(units), "sequences", shown=progress):
+            unit = units[index]
+            made[unit.name] = unit.role
+            if reason:
+                number = kept[unit.name]
+                outcomes[number] = _left_out(outcomes[number], reason)
 
 
 def _left_out(outcome: Outcome, reason: str | Died) -> Outcome:

@@ -11,7 +11,6 @@ import pandas as pd
 import pyarrow as pa
 import torch
 from jaxtyping import Bool, Float
-from tqdm import tqdm
 
 from data_prep.correct import correct_pair
 from data_prep.select import select_pairs
@@ -29,6 +28,7 @@ from extrap_train.data.frame_files import (
 from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
 from extrap_train.matching import Matcher
 from extrap_train.store.atomic import atomic_folder
+from extrap_train.terminal import track
 
 MIN_DEPTH_SHARE = 0.02
 """A frame with less of its depth known cannot be a reference: its warp would be empty."""
@@ -115,13 +115,12 @@ def correct_pairs(
     flows: list[np.ndarray] = []
     rows = []
     columns = [pairs[name] for name in ("reference", "query", "split")]
-    bar = tqdm(
+    bar = track(
         zip(*columns, strict=True),
         "correcting",
         len(pairs),
-        unit="pair",
-        leave=False,
-        disable=not progress or matcher is None,
+        "pairs",
+        shown=progress and matcher is not None,
     )
     for reference, query, split in bar:
         if matcher is None or split != "train":

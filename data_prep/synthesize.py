@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tqdm import tqdm
 
 from extrap_train.config import SyntheticConfig
 from extrap_train.data.annotations import read_sequence_annotations
@@ -24,6 +23,7 @@ from extrap_train.data.synthetic import (
 from extrap_train.errors import InputError
 from extrap_train.jobs import Died, Launcher
 from extrap_train.store.atomic import install_folder, partial_path, remove_leftovers, write_atomic
+from extrap_train.terminal import track
 
 LOOK = 2
 """Raised whenever the same options give other pictures, so that old ones are not mixed with new."""
@@ -144,7 +144,7 @@ def _render_all(jobs: list[_Job], launcher: Launcher) -> None:
     if not jobs:
         return
     done = launcher.run(_render_sequence, jobs)
-    for index, result in tqdm(done, f"render {jobs[0].category}", len(jobs), unit="sequence"):
+    for index, result in track(done, f"rendering {jobs[0].category}", len(jobs), "sequences"):
         if isinstance(result, Died):
             raise InputError(f"{jobs[index].folder}: not rendered: {result.reason}")
 

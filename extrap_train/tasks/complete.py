@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from tqdm import tqdm
 
 from extrap_train.config import (
     DatasetDepthConfig,
@@ -51,7 +50,7 @@ from extrap_train.store.atomic import file_lock, write_atomic
 from extrap_train.tasks.completed import Completed, write_completed
 from extrap_train.tasks.scene_folder import require_same, result_folder
 from extrap_train.tasks.scene_inputs import device_of, required_scene, trained_model
-from extrap_train.terminal import terminal
+from extrap_train.terminal import progress, terminal
 from extrap_train.views import stack_cameras, stack_poses
 
 _NOT_PART_OF_THE_MAP = (
@@ -263,13 +262,13 @@ def _completed(
     folder = job.folder / "map"
     there = {view.view.name for view in known.views}
     left = sum(query.name not in there for query in queries)
-    with tqdm(total=left, desc="views", unit="view", disable=not left) as bar:
+    with progress("completing", left, "views") as bar:
 
         def on_step(grown: GlobalMap, added: MapView, step: Step) -> None:
             save_step(step, folder, len(grown) - 1)
             save_view(added, folder, len(grown) - 1)
             if viewer is not None:
                 viewer.show(grown)
-            bar.update()
+            bar.advance()
 
         return complete(known, queries, workshop, on_step)

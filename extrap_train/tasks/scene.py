@@ -11,7 +11,6 @@ from typing import Any
 import torch
 from lightning.fabric import Fabric
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from data_prep.views import target_views
 from extrap_train.config import SamplerConfig, TrainConfig, dotted, sampler_for
@@ -44,7 +43,7 @@ from extrap_train.tasks.scene_inputs import (
     required_scene,
     trained_model,
 )
-from extrap_train.terminal import terminal
+from extrap_train.terminal import progress, terminal
 from extrap_train.views import View, stack_cameras
 
 
@@ -89,11 +88,11 @@ def _run(
     if config.trainer.gradient_checkpointing:
         model.unet.enable_gradient_checkpointing()
     adapter = add_adapter(model, config.lora, config.seed)
-    with _bar() as bar, advice_where_adapting_ends(config.lora, config.trainer):
-        task = bar.add_task("adapt", total=1.0, note="")
+    advice = advice_where_adapting_ends(config.lora, config.trainer)
+    with progress("adapting", 100, "%") as bar, advice:
 
         def on_step(step: int, share: float) -> None:
-            bar.update(task, completed=min(share, 1.0), note=f"step {step}")
+            bar.reach(round(100 * min(share, 1.0)), f"step {step}")
 
         done = adapt(
             model,
@@ -256,9 +255,3 @@ def _said(done: Adaptation, measured: dict[str, dict[str, float]]) -> str:
 def _outcome(done: Adaptation) -> str:
     kept = f"kept step {done.best_step} of {done.steps}" if done.best_step else "kept the base"
     return f"ended by {done.ended} after {done.seconds:.0f} s, {kept}"
-
-
-def _bar() -> Progress:
-    return Progress(
-        TextColumn("adapt"), BarColumn(), TimeRemainingColumn(), TextColumn("{task.fields[note]}")
-    )
