@@ -124,7 +124,7 @@ def _made(job: CellJob, scene: Scene) -> Made:
 
 def read_cell_images(folder: Path, record: Mapping[str, Any]) -> Float[Tensor, "n 3 h w"]:
     """The saved images of a finished cell, in the targets' order."""
-    return images_of(read_cell_files(folder, record, "images").values())
+    return images_of(read_cell_files(folder, record, "images"))
 
 
 def write_cell(folder: Path, record: Mapping[str, Any], files: Mapping[str, bytes]) -> None:

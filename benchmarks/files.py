@@ -4,18 +4,19 @@ clouds.
 
 import io
 import json
-from collections.abc import Iterable
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from PIL import Image
 from plyfile import PlyData, PlyParseError
 from torch import Tensor
 
-from extrap_train.data.images import to_eight_bits
+from extrap_train.data.images import ARRAY_ERRORS, to_eight_bits
+from extrap_train.data.picture_files import DECODER_ERRORS, MAX_PIXELS
 from extrap_train.errors import InputError
 
 
@@ -31,10 +32,22 @@ def png_bytes(image: Float[Tensor, "3 h w"]) -> bytes:
     return content.getvalue()
 
 
-def images_of(pictures: Iterable[bytes]) -> Float[Tensor, "n 3 h w"]:
-    """Images of one size as their files hold them: 8 bits, here in [0, 1]."""
-    arrays = [np.array(Image.open(io.BytesIO(content))) for content in pictures]
+def images_of(pictures: Mapping[str, bytes]) -> Float[Tensor, "n 3 h w"]:
+    """Images of one size from the contents of PNG files, by name: 8 bits there, here in [0, 1]."""
+    arrays = [_decode_png(name, content) for name, content in pictures.items()]
+    if len({array.shape for array in arrays}) != 1:
+        raise InputError(f"{', '.join(pictures)}: expected images of one size; make the cell again")
     return torch.from_numpy(np.stack(arrays)).permute(0, 3, 1, 2).float() / 255
+
+
+def _decode_png(name: str, content: bytes) -> UInt8[np.ndarray, "h w 3"]:
+    try:
+        picture = Image.open(io.BytesIO(content), formats=("PNG",))
+        if picture.mode == "RGB" and picture.width * picture.height <= MAX_PIXELS:
+            return np.array(picture)
+    except DECODER_ERRORS:
+        pass
+    raise InputError(f"{name}: is no PNG picture in 8-bit RGB; make the cell again")
 
 
 def npy_bytes(values: Tensor) -> bytes:
@@ -46,7 +59,13 @@ def npy_bytes(values: Tensor) -> bytes:
 
 def array_of(content: bytes) -> Tensor:
     """The array that a file of `npy_bytes` holds."""
-    return torch.from_numpy(np.load(io.BytesIO(content)))
+    try:
+        array = np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
+        return torch.from_numpy(array.astype(np.float32, copy=False))
+    except ARRAY_ERRORS as error:
+        raise InputError(
+            f"an array of a result is damaged ({error}); make its cell again"
+        ) from None
 
 
 def read_points(path: Path) -> Float[Tensor, "m 3"]:

@@ -74,7 +74,7 @@ def score_files(
 ) -> dict[str, Score]:
     """Every metric of a cell from its files."""
     clouds = [array_of(content) for content in points.values()]
-    scores = score_images(images_of(images.values()), truth, scoring)
+    scores = score_images(images_of(images), truth, scoring)
     return scores | score_points(clouds[0] if clouds else None, truth)
 
 

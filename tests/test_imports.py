@@ -106,7 +106,7 @@ def test_what_is_imported_is_declared() -> None:
     """Whatever another package happens to bring along is not ours to rely on."""
     project = tomllib.loads((_ROOT / "pyproject.toml").read_text())["project"]
     declared = {
-        re.split(r"[^\w.-]", line)[0].lower()
+        _normalised(re.split(r"[^\w.-]", line)[0])
         for lines in (project["dependencies"], *project["optional-dependencies"].values())
         for line in lines
     }
@@ -116,9 +116,13 @@ def test_what_is_imported_is_declared() -> None:
     undeclared = {
         name
         for name in imported - ours - set(sys.stdlib_module_names)
-        if not declared & {d.lower() for d in distributions.get(name, [name])}
+        if not declared & {_normalised(d) for d in distributions.get(name, [name])}
     }
     assert not undeclared
+
+
+def _normalised(distribution: str) -> str:
+    return re.sub(r"[-_.]+", "-", distribution).lower()
 
 
 def test_every_file_is_short() -> None:

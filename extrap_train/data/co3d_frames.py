@@ -17,8 +17,7 @@ from extrap_train.data.co3d_cameras import Cameras, cameras_of, frame_label
 from extrap_train.data.images import (
     known_depth,
     read_depth_mask,
-    read_image,
-    read_mask,
+    read_photograph,
     read_sixteen_bit,
 )
 from extrap_train.data.paths import resolve_inside
@@ -49,11 +48,13 @@ class _Photograph:
     def load(self, *, depth: bool = True) -> View:
         size = self.camera.height, self.camera.width
         mask_path = self.mask_path and resolve_inside(self.root, self.mask_path)
+        image_path = resolve_inside(self.root, self.image_path)
+        image, mask = read_photograph(image_path, size, mask_path or None)
         return View(
-            image=read_image(resolve_inside(self.root, self.image_path), size),
+            image=image,
             camera=self.camera,
             depth=_read_depth(self.root, self.depth, size) if depth and self.depth else None,
-            mask=read_mask(mask_path, size) if mask_path else None,
+            mask=mask,
             name=self.name,
         )
 

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrap_train.data.images import known_depth, read_image, read_mask, read_sixteen_bit
+from extrap_train.data.images import read_depth, read_photograph
 from extrap_train.data.paths import resolve_inside
 from extrap_train.data.sequences import Frame, PointCloud, Sequence
 from extrap_train.data.validation import degenerate_camera, require_sound
@@ -57,10 +57,10 @@ class _Loader:
 
     def load(self, *, depth: bool = True) -> View:
         photo, size = self.photograph, (self.camera.height, self.camera.width)
-        image = read_image(resolve_inside(self.root, photo.image_path), size)
+        image_path = resolve_inside(self.root, photo.image_path)
+        mask_path = resolve_inside(self.root, photo.mask_path) if photo.mask_path else None
+        image, mask = read_photograph(image_path, size, mask_path)
         far = _read_depth(self.root, photo) if depth and photo.depth_path else None
-        mask_path = photo.mask_path and resolve_inside(self.root, photo.mask_path)
-        mask = read_mask(mask_path, size) if mask_path else None
         return View(
             image=self._straight(image.permute(1, 2, 0)).permute(2, 0, 1).contiguous(),
             camera=self.camera,
@@ -164,19 +164,4 @@ def pinhole_camera(photo: Photograph, description: Path) -> tuple[Lens, Camera]:
 
 def _read_depth(root: Path, photo: Photograph) -> Float[Tensor, "h w"]:
     path = resolve_inside(root, photo.depth_path or "")
-    size = (photo.height, photo.width)
-    raw = _read_npy(path, size) if path.suffix == ".npy" else read_sixteen_bit(path, size)
-    return known_depth(raw, photo.depth_scale, path)
-
-
-def _read_npy(path: Path, size: tuple[int, int]) -> np.ndarray:
-    try:
-        # Mapped, not read: the header may promise any size.
-        raw = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path}: is no array of numbers ({error}); restore it") from None
-    if raw.shape != size or raw.dtype.kind not in "fiu":
-        raise InputError(
-            f"{path}: is an array of {raw.dtype} {raw.shape}, expected numbers {size}; restore it"
-        )
-    return np.array(raw)
+    return read_depth(path, (photo.height, photo.width), photo.depth_scale)

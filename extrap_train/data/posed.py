@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrap_train.data.images import image_size
 from extrap_train.data.json_files import read_json
 from extrap_train.data.paths import check_relative, resolve_inside
 from extrap_train.data.photographs import (
@@ -18,6 +17,7 @@ from extrap_train.data.photographs import (
     present_pictures,
     sequence_of_photographs,
 )
+from extrap_train.data.picture_files import image_size
 from extrap_train.data.sequences import PointCloud, Sequence
 from extrap_train.data.validation import require_dict, require_list
 from extrap_train.errors import InputError

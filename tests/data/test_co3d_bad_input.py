@@ -233,9 +233,9 @@ def test_truncated_depth(root):
 @pytest.mark.parametrize("kind", ["image", "depth", "mask"])
 def test_size_that_is_not_the_annotated_one(root, kind):
     file = root / frame_entries(root)[0][kind]["path"]
-    Image.open(file).resize((20, 16)).save(file)
+    Image.open(file).resize((20, 20)).save(file)
     message = complaint(load_first, root)
-    assert f"{file.name}: is 16 x 20 pixels" in message
+    assert f"{file.name}: is 20 x 20 pixels" in message
     assert "says 32 x 40" in message
 
 
