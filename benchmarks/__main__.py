@@ -10,6 +10,7 @@ from benchmarks.catalogue import Catalogue
 from benchmarks.table_checks import check_table, lpips_weights_of, require_output_alone
 from extrap_train.config import CATEGORIES
 from extrap_train.errors import InputError
+from extrap_train.exits import Ended, ends_in_one_line
 
 PERF_NAMES = ("align", "depth", "gaussians", "prep", "sample", "train", "warp")
 KINDS = ("methods", "tables", "categories")
@@ -22,14 +23,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status."""
     options = _parsed(arguments)
     try:
+        with ends_in_one_line():
+            return _run_command(options)
+    except Ended as end:
+        return end.code
+
+
+def _run_command(options: argparse.Namespace) -> int:
+    try:
         status: int = options.run(options)
-        return status
-    except (InputError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("interrupted: run the same command again to go on", file=sys.stderr)
-        return 130
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise InputError(str(error)) from error
+    return status
 
 
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:

@@ -20,6 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from extrap_train import config as schema
 from extrap_train.errors import InputError
+from extrap_train.exits import ends_in_one_line
 from extrap_train.option_errors import options_of
 from extrap_train.tasks import TASKS
 
@@ -96,8 +97,7 @@ def command(name: str, run: Callable[[Any], Path | None]) -> None:
     """
     register_schemas()
 
-    @hydra.main(version_base="1.3", config_path="pkg://conf", config_name=name)
-    def composed(config: DictConfig) -> Path | None:
+    def checked(config: DictConfig) -> Path | None:
         output = "."
         try:
             typed = typed_config(config)
@@ -105,27 +105,28 @@ def command(name: str, run: Callable[[Any], Path | None]) -> None:
             _check_processes(typed)
             _use_threads(getattr(typed, "threads", None))
             return run(typed)
-        except InputError as error:
-            if HydraConfig.get().mode == RunMode.MULTIRUN:
-                raise  # the other jobs of a sweep still run
-            sys.exit(f"error: {error}")  # before Hydra adds a line of its own
         except OSError as error:
             said = _remedy(error, output)
-            if said is None or HydraConfig.get().mode == RunMode.MULTIRUN:
+            if said is None:
                 raise
-            sys.exit(f"error: {error.filename or output}: {error.strerror}; {said}")
+            message = f"{error.filename or output}: {error.strerror}; {said}"
+            raise InputError(message) from error
 
-    try:
-        _complete_help(sys.argv)
-        os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # what is left to go wrong is a bug
-        composed()
-    except InputError as error:
-        sys.exit(f"error: {error}")
-    except (HydraException, OmegaConfBaseException) as error:
-        options = options_of(*_COMMANDS[name])
-        sys.exit(f"error: {options.one_line(error, _overrides(sys.argv[1:]))}")
-    except KeyboardInterrupt as stopped:
-        sys.exit(f"interrupted: {str(stopped) or 'run the same command again to resume'}")
+    @hydra.main(version_base="1.3", config_path="pkg://conf", config_name=name)
+    def composed(config: DictConfig) -> Path | None:
+        if HydraConfig.get().mode == RunMode.MULTIRUN:
+            return checked(config)  # the other jobs of a sweep still run
+        with ends_in_one_line():  # before Hydra adds a line of its own
+            return checked(config)
+
+    with ends_in_one_line():
+        try:
+            _complete_help(sys.argv)
+            os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # what is left to go wrong is a bug
+            composed()
+        except (HydraException, OmegaConfBaseException) as error:
+            options = options_of(*_COMMANDS[name])
+            raise InputError(options.one_line(error, _overrides(sys.argv[1:]))) from None
 
 
 def _remedy(error: OSError, output: str) -> str | None:

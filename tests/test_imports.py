@@ -28,6 +28,7 @@ _RANK = {
     "extrap_train.processes": 4,
     "extrap_train.diffusion": 5,
     "extrap_train.terminal": 1,
+    "extrap_train.exits": 1,
     "extrap_train.option_errors": 2,
     "extrap_train.trained_on": 4,
     "extrap_train.runs": 5,
