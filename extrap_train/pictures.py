@@ -120,8 +120,9 @@ def picture(image: Float[Tensor, "3 h w"], path: Path) -> None:
 
 
 def picture_names(names: Sequence[str]) -> list[str]:
-    """A file name each, without suffix, for names that may be paths; no two meet, whatever their
-    case and also with `_warp` behind one.
+    """One file name, without suffix or white space, for each of some names, which may be paths.
+
+    They differ in more than their case, also with `_warp` appended to one of them.
     """
     taken: set[str] = set()
     chosen = []

@@ -12,7 +12,7 @@ from plyfile import PlyData, PlyElement
 from extrap_train.data.images import to_eight_bits
 from extrap_train.geometry.colmap import colmap_from_world_to_cam
 from extrap_train.geometry.opengl import opengl_from_world_to_cam
-from extrap_train.pictures import picture
+from extrap_train.pictures import picture, picture_names
 from extrap_train.reconstruction.cloud import PointCloud
 from extrap_train.reconstruction.global_map import GlobalMap, MapView
 from extrap_train.reconstruction.inputs import WorldUnit
@@ -21,6 +21,8 @@ from extrap_train.views import Camera
 
 MOST_COLMAP_POINTS = 50_000
 """COLMAP's points only start a reconstruction: a text of millions helps nobody."""
+DEPTH_UNIT = 0.001
+"""Scene units per unit of the depth files: nerfstudio takes this one, whatever the file says."""
 
 
 def write_cloud(cloud: PointCloud, path: Path) -> None:
@@ -37,12 +39,14 @@ def write_cloud(cloud: PointCloud, path: Path) -> None:
 
 
 def write_views(known: GlobalMap, unit: WorldUnit, folder: Path) -> None:
-    """Write every view's picture, depth and confidence under `views/`, and `transforms.json`."""
+    """Write every view's picture, depth and confidence under `views/`, and `transforms.json`.
+
+    Depth is in units of `DEPTH_UNIT`.
+    """
     entries = []
-    for number, view in enumerate(known.views):
-        stem = _stem(view, number)
+    for stem, view in zip(_stems(known), known.views, strict=True):
         picture(view.view.image, folder / "views" / f"{stem}.png")
-        _write_array(view.depth * unit.unit, folder / "views" / f"{stem}.depth.npy")
+        _write_array(view.depth * unit.unit / DEPTH_UNIT, folder / "views" / f"{stem}.depth.npy")
         _write_array(view.confidence, folder / "views" / f"{stem}.confidence.npy")
         entries.append(_entry(view, stem, unit.outside(view.camera)))
     content = {"camera_model": "PINHOLE", "ply_file_path": "cloud.ply", "frames": entries}
@@ -55,14 +59,14 @@ def write_colmap(known: GlobalMap, unit: WorldUnit, cloud: PointCloud, folder: P
     `cloud` is in the photographs' world; its points have no tracks.
     """
     cameras, images = [], []
-    for number, view in enumerate(known.views, 1):
+    for number, (stem, view) in enumerate(zip(_stems(known), known.views, strict=True), 1):
         camera = unit.outside(view.camera)
         k = camera.intrinsics.double()
         lens = " ".join(repr(float(x)) for x in (k[0, 0], k[1, 1], k[0, 2], k[1, 2]))
         cameras.append(f"{number} PINHOLE {camera.width} {camera.height} {lens}")
         quaternion, translation = colmap_from_world_to_cam(camera.world_to_cam.double())
         pose = " ".join(repr(float(x)) for x in (*quaternion, *translation))
-        images.append(f"{number} {pose} {number} {_stem(view, number - 1)}.png\n")
+        images.append(f"{number} {pose} {number} {stem}.png\n")
     model = folder / "colmap" / "sparse" / "0"
     _write_lines(model / "cameras.txt", cameras)
     _write_lines(model / "images.txt", images)
@@ -81,8 +85,10 @@ def _point_lines(cloud: PointCloud, chosen: Sequence[int]) -> list[str]:
     ]
 
 
-def _stem(view: MapView, number: int) -> str:
-    return f"{number:03d}_{Path(view.view.name).stem}"
+def _stems(known: GlobalMap) -> list[str]:
+    """File names without suffix or white space, at which COLMAP would end a name."""
+    names = picture_names([view.view.name for view in known.views])
+    return [f"{number:03d}_{name}" for number, name in enumerate(names)]
 
 
 def _entry(view: MapView, stem: str, camera: Camera) -> dict[str, object]:
@@ -90,7 +96,7 @@ def _entry(view: MapView, stem: str, camera: Camera) -> dict[str, object]:
     return {
         "file_path": f"views/{stem}.png",
         "depth_file_path": f"views/{stem}.depth.npy",
-        "depth_unit_scale_factor": 1.0,
+        "depth_unit_scale_factor": DEPTH_UNIT,
         "transform_matrix": opengl_from_world_to_cam(camera.world_to_cam.double()).tolist(),
         "w": camera.width,
         "h": camera.height,
