@@ -68,5 +68,7 @@ class CompletionConfig:
     """Print and draw the plan, and stop."""
     viewer: bool = False
     """Show the growing cloud in a browser; needs the extra `viewer`."""
+    host: str = "127.0.0.1"
+    """Address that the viewer listens on: this machine alone; `0.0.0.0` lets others see it, too."""
     port: int = 8080
-    """Of the viewer."""
+    """Port of the viewer, or the next free one."""

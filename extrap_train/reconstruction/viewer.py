@@ -27,12 +27,15 @@ class CloudViewer:
     """A page with the cloud, the cameras, a slider over the steps and a least confidence.
 
     Given views have blue frusta, generated ones orange. `show` may be called again and again; the
-    page follows the newest step unless its visitor has gone back to an earlier one.
+    page follows the newest step unless its visitor has gone back to an earlier one. Only this
+    machine reaches it unless `host` says otherwise, and no other web page may talk to it.
     """
 
-    def __init__(self, port: int, votes: bool = True) -> None:
+    def __init__(self, port: int, votes: bool = True, host: str = "127.0.0.1") -> None:
         try:
             import viser
+
+            from extrap_train.reconstruction import viewer_pages
         except ImportError:
             raise InputError(
                 'viewer=true needs viser: pip install "extrap-train[viewer]"'
@@ -42,8 +45,12 @@ class CloudViewer:
         self._cloud: PointCloud | None = None
         self._known: GlobalMap | None = None
         self._frusta: dict[int, Any] = {}
-        self._server = viser.ViserServer(port=port, verbose=False)
+        viewer_pages.require_own_address(host)
+        with viewer_pages.answer_own_pages_only(host):
+            self._server = viser.ViserServer(host=host, port=port, verbose=False)
+        self._host = host
         gui: Any = self._server.gui  # its typing makes values read-only
+        gui.configure_theme(show_share_button=False)  # it would open a tunnel to a public server
         self._step = gui.add_slider("views", min=1, max=2, step=1, initial_value=1)
         self._least = gui.add_slider("least confidence", 0.0, 1.0, 0.05, 0.1)
         self._count = gui.add_text("points", "0", disabled=True)
@@ -54,6 +61,13 @@ class CloudViewer:
     def port(self) -> int:
         """Where the page is: the wanted port, or the next free one."""
         return int(self._server.get_port())
+
+    @property
+    def url(self) -> str:
+        """The page's address as a browser on this machine takes it."""
+        everywhere = self._host in ("127.0.0.1", "0.0.0.0", "::", "::1", "")
+        host = f"[{self._host}]" if ":" in self._host else self._host
+        return f"http://{'localhost' if everywhere else host}:{self.port}"
 
     @property
     def shown_points(self) -> int:

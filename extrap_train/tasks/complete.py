@@ -56,6 +56,7 @@ from extrap_train.views import stack_cameras, stack_poses
 _NOT_PART_OF_THE_MAP = (
     "dry_run",
     "viewer",
+    "host",
     "port",
     "held_out",
     "splats",
@@ -244,9 +245,9 @@ def _viewer(job: _Job, known: GlobalMap, console: Console) -> Iterator[CloudView
     if not options.viewer:
         yield None
         return
-    with CloudViewer(options.port, options.confidence.votes) as viewer:
+    with CloudViewer(options.port, options.confidence.votes, options.host) as viewer:
         viewer.show(known)
-        console.print(f"viewer: http://localhost:{viewer.port}")
+        console.print(f"viewer: {viewer.url}")
         yield viewer
         if sys.stdin.isatty():
             input("the scene is complete and written; Enter closes the viewer ")

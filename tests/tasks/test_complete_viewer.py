@@ -28,10 +28,10 @@ _TINY = [
 class _Page(CloudViewer):
     """A viewer without a server."""
 
-    port = 0
+    url = ""
     closed = False
 
-    def __init__(self, port: int, votes: bool) -> None:
+    def __init__(self, port: int, votes: bool, host: str) -> None:
         pass
 
     def show(self, known: GlobalMap) -> None:
