@@ -1,6 +1,9 @@
-"""Splatting three references into a query, projection included."""
+"""Splatting three references into a query, projection included; and how much of its rays they leave
+unobserved.
+"""
 
 import math
+from collections.abc import Callable
 
 import torch
 from jaxtyping import Float
@@ -10,22 +13,25 @@ from benchmarks.perf.timing import Row, compare
 from benchmarks.perf.warp_reference import splat_reference
 from extrap_train.geometry.cameras import unproject_to_world
 from extrap_train.geometry.splat import splat
-from extrap_train.views import Camera
+from extrap_train.geometry.visibility import Ball, Visibility, trace_torch, trace_visibility
+from extrap_train.views import Camera, stack_cameras
 
 CHANNELS = 7
 """Colour, reference coordinates, depth, and which reference: what a warp carries."""
 SIZES = (256, 512)
+VISIBILITY_SIZES = (128, 256)
 ANGLES_DEG = (0.0, -30.0, 40.0)
 QUERY_ANGLE_DEG = 15.0
 
 
 def run() -> list[Row]:
-    """One row an image size; on the GPU, too, where there is one."""
+    """Rows for every image size; on the GPU, too, where there is one."""
     names = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
-    return [_compare(size, torch.device(name)) for name in names for size in SIZES]
+    rows = [_compare_splats(size, torch.device(name)) for name in names for size in SIZES]
+    return [*rows, *(_compare_visibility(size) for size in VISIBILITY_SIZES)]
 
 
-def _compare(size: int, device: torch.device) -> Row:
+def _compare_splats(size: int, device: torch.device) -> Row:
     points, values = (x.to(device) for x in bumpy_views(size))
     query = orbit_camera(QUERY_ANGLE_DEG, size).to(device)
 
@@ -34,6 +40,26 @@ def _compare(size: int, device: torch.device) -> Row:
         device,
         lambda: splat(points, values, query).means,
         lambda: splat_reference(points, values, query).permute(2, 0, 1),
+    )
+
+
+def _compare_visibility(size: int) -> Row:
+    """Unobserved space along the rays of a query from aside; on the CPU, where there are two
+    implementations of it."""
+    references = stack_cameras([orbit_camera(angle, size) for angle in ANGLES_DEG])
+    cameras, query = stack_cameras([references]), stack_cameras([orbit_camera(120.0, size)])
+    depths = bumpy_depth(size).expand(1, len(ANGLES_DEG), size, size).contiguous()
+    valid = torch.ones(1, len(ANGLES_DEG), dtype=torch.bool)
+    surface, ball = torch.zeros(1, size, size), Ball.around(references)
+
+    def trace(implementation: Callable[..., Visibility]) -> Float[Tensor, "b h w"]:
+        return implementation(depths, cameras, valid, query, surface, ball).unobserved
+
+    return compare(
+        f"unobserved space, {len(ANGLES_DEG)} references, {size}x{size}",
+        torch.device("cpu"),
+        lambda: trace(trace_visibility),
+        lambda: trace(trace_torch),
     )
 
 
