@@ -38,7 +38,6 @@ _NOT_PART_OF_THE_RUN = (
     "trainer.checkpoint_every",
     "trainer.validate_every",
     "complete",
-    "average_width",
     "model.sampler",
     *(field.name for field in fields(SceneOptions)),
 )
@@ -46,17 +45,6 @@ _NOT_PART_OF_THE_RUN = (
 that is saved, how the machine goes about the same mathematics, and what other tasks read. What the
 model recommends to sample with is part of the run as far as it is used, under `sampler`.
 """
-
-_ADDED = {"model.joint_views": 1, "data.set_list": None}
-"""Options that came later, with the value that leaves all as it was: runs keep their names."""
-
-_FORMERLY = {
-    "trainer.accelerator": "auto",
-    "trainer.workers": 0,
-    "trainer.checkpoint_every": 200,
-    "trainer.validate_every": 400,
-}
-"""Options that once counted, with the value that most runs had: they keep their names."""
 
 _LATEST = "latest"
 """Link to the newest run of a model and category."""
@@ -78,11 +66,6 @@ class RunFolder:
     def samples(self) -> Path:
         """Picture sheets, one a validation."""
         return self.path / "samples"
-
-    @property
-    def averages(self) -> Path:
-        """Snapshots of the weights' averages, named by their step."""
-        return self.path / "averages"
 
     @property
     def model(self) -> Path:
@@ -138,8 +121,7 @@ def _said(config: TrainConfig) -> dict[str, Any]:
 
 
 def _digest(identity: dict[str, Any]) -> str:
-    named = {k: v for k, v in identity.items() if k not in _ADDED or v != _ADDED[k]}
-    return hashlib.sha256(json.dumps(_FORMERLY | named, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
 
 
 def run_folder(config: TrainConfig) -> RunFolder:

@@ -218,13 +218,6 @@ class PairBatch:
     are."""
     warp: Warp | None = None
     """Made from the references when the batch is made; None before."""
-    joint_views: int = 1
-    """So many consecutive examples are views of one scene that are denoised together."""
-
-    def asked(self) -> "PairBatch":
-        """The first example of each group, without those that were denoised beside it."""
-        firsts = combine([self], lambda tensors: tensors[0][:: self.joint_views])
-        return replace(firsts, joint_views=1)
 
     def to(self, device: torch.device | str) -> "PairBatch":
         """The same batch on another device."""

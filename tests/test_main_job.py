@@ -13,18 +13,13 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-import torch
-from safetensors.torch import load_file
 from tiny_job import TINY
-
-from extrap_train.diffusion.checkpoint import load_model
 
 _OPTIONS = [
     *TINY,
     "trainer.steps=12",
     "trainer.checkpoint_every=3",
     "trainer.validate_every=6",
-    "trainer.power_averages=true",
     "validation.examples=4",
     "validation.pictures=2",
     "sampler.steps=2",
@@ -63,9 +58,8 @@ def _run_folder(output: Path) -> Path:
 
 
 def _weights(output: Path) -> dict[str, bytes]:
-    """The model's, and the snapshots of its averages."""
     run = _run_folder(output)
-    files = [p for part in ("model", "averages") for p in (run / part).rglob("*.safetensors")]
+    files = (run / "model").rglob("*.safetensors")
     return {str(p.relative_to(run)): p.read_bytes() for p in files}
 
 
@@ -96,25 +90,6 @@ def test_a_second_run_says_that_it_is_done(undisturbed: Path) -> None:
     assert _weights(undisturbed) == before
 
 
-def test_an_average_of_another_length_is_a_model_with_its_own_scores(
-    undisturbed: Path, tmp_path: Path
-) -> None:
-    shutil.copytree(undisturbed, tmp_path / "copy", symlinks=True)
-    run = _run_folder(tmp_path / "copy")
-    _finish(tmp_path / "copy", "task=average", "average_width=0.1")
-    made = run / "averages" / "width-0.1"
-    assert json.loads((made / "summary.json").read_text())["steps"] == 12
-    kept = load_file(run / "averages" / "step-00000012.safetensors")
-    weights = dict(load_model(made / "model").named_parameters())
-    assert len(kept) == 2 * len(weights)
-    for name, parameter in weights.items():
-        assert torch.allclose(parameter, kept[f"0.1/{name}"].float(), atol=1e-4)
-    shutil.rmtree(run / "averages")
-    process = _start(tmp_path / "copy", "task=average")
-    assert process.wait(timeout=300) == 1
-    assert "train with trainer.power_averages=true" in _said(tmp_path / "copy")
-
-
 def test_a_finished_run_is_measured_again_sampled_otherwise(
     undisturbed: Path, tmp_path: Path
 ) -> None:
@@ -131,24 +106,6 @@ def test_a_finished_run_is_measured_again_sampled_otherwise(
     assert all(score["nearest"] == own["nearest"] for score in scores)
     assert all(summary["steps"] == 12 for summary in found)
     assert (run / "summary.json").read_bytes() == before
-
-
-def test_views_denoised_together_are_measured_as_the_same_views(
-    undisturbed: Path, tmp_path: Path
-) -> None:
-    shutil.copytree(undisturbed, tmp_path / "copy", symlinks=True)
-    _finish(tmp_path / "copy", "run=together", "model.joint_views=2", "trainer.steps=3")
-    runs = [_run_folder(undisturbed), _run_folder(tmp_path / "copy")]
-    assert runs[1].name == "together"
-    alone, together = (
-        pd.read_csv(run / "validation.csv").set_index(["method", "view"]).sort_index()
-        for run in runs
-    )
-    assert list(alone.index) == list(together.index)
-    baselines = alone.index.get_level_values("method") != "model"
-    pd.testing.assert_frame_equal(alone[baselines], together[baselines])
-    unets = [load_file(run / "model/unet/diffusion_pytorch_model.safetensors") for run in runs]
-    assert {k: v.shape for k, v in unets[0].items()} == {k: v.shape for k, v in unets[1].items()}
 
 
 _KILLED_WITHIN = """

@@ -51,20 +51,16 @@ def test_an_option_differs_from_the_default_in_what_it_is_named_for(
 ) -> None:
     default = run_identity(options["options/default"])
     changed = {
-        name: {k for k, v in run_identity(config).items() if v != default[k]}
-        - {"task", "trainer.power_averages"}
+        name: {k for k, v in run_identity(config).items() if v != default[k]} - {"task"}
         for name, config in options.items()
     }
     assert changed["options/min_snr"] == {"trainer.min_snr"}
     assert changed["options/geometry"] == {"model.geometry"}
-    assert changed["options/joint_views"] == {"model.joint_views"}
     assert changed["options/v_prediction"] == {"model.prediction"}
     for name, config in options.items():
         if config.task == "validate":
             assert all(key.startswith("sampler.") for key in changed[name])
             assert changed[name]
-    widths = [o.average_width for o in options.values() if o.task == "average"]
-    assert sorted(set(widths)) == widths
 
 
 def test_the_sweep_changes_no_other_run(options: dict[str, TrainConfig]) -> None:

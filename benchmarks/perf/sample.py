@@ -22,8 +22,8 @@ from benchmarks.perf.diffusion_case import (
 from benchmarks.perf.timing import Row, compare
 from extrap_train.config import SamplerConfig
 from extrap_train.diffusion.model import ExtrapolationModel
-from extrap_train.diffusion.sampler import sample_views, view_generator
-from extrap_train.diffusion.schedule import solver_of
+from extrap_train.diffusion.sampler import sample_ddim, sample_views, view_generator
+from extrap_train.diffusion.schedule import ddim_timesteps
 from extrap_train.views import PairBatch
 
 _GUIDANCE = 3.0
@@ -71,9 +71,8 @@ def sampling(model: ExtrapolationModel, batch: PairBatch, steps: int) -> Samplin
     device = batch.image.device
 
     def sample() -> Float[Tensor, "b 3 h w"]:
-        generators = [view_generator(0, str(i)) for i in range(len(batch.image))]
         with torch.autocast(device.type, torch.bfloat16):
-            return sample_views(model, batch, options, generators)
+            return sample_views(model, batch, options, _names(batch))
 
     return sample
 
@@ -85,17 +84,24 @@ def plain_sampling(model: ExtrapolationModel, batch: PairBatch, steps: int) -> S
     def sample() -> Float[Tensor, "b 3 h w"]:
         condition = model.condition(batch)
         null = condition.zeroed(torch.ones_like(condition.token_weight, dtype=torch.bool))
-        draws = [
-            torch.randn(condition.base.shape[1:], generator=view_generator(0, str(i)))
-            for i in range(len(batch.image))
-        ]
-        latent = torch.stack(draws).to(condition.base)
-        solver = solver_of(model.schedule, SamplerConfig(steps=steps))
-        for timestep in solver.timesteps:
-            times = torch.full((len(latent),), int(timestep), device=latent.device)
+
+        def denoise(latent: Float[Tensor, "b z h w"], timestep: int) -> Float[Tensor, "b z h w"]:
+            times = torch.full((len(latent),), timestep, device=latent.device)
             conditional, without = model(latent, times, condition), model(latent, times, null)
-            prediction = without + _GUIDANCE * (conditional - without)
-            latent = solver.step(prediction, timestep, latent, 0.0, None)
+            return without + _GUIDANCE * (conditional - without)
+
+        def draw_noise() -> Float[Tensor, "b z h w"]:
+            generators = [view_generator(0, name) for name in _names(batch)]
+            shape = condition.base.shape[1:]
+            drawn = torch.stack([torch.randn(shape, generator=g) for g in generators])
+            return drawn.to(condition.base)
+
+        timesteps = ddim_timesteps(model.schedule, SamplerConfig(steps=steps))
+        latent = sample_ddim(denoise, model.schedule, timesteps, 0.0, draw_noise)
         return model.decode_target(latent, condition)
 
     return sample
+
+
+def _names(batch: PairBatch) -> list[str]:
+    return [str(i) for i in range(len(batch.image))]

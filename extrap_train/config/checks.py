@@ -17,7 +17,7 @@ _ACCELERATORS = ("auto", "cpu", "gpu", "cuda", "mps")
 _PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
 """Weights stay in single precision: in half, an optimiser's small steps would be lost."""
 
-_ON_PAIRS = ("average", "category", "validate")
+_ON_PAIRS = ("category", "validate")
 """Tasks that prepare pairs of photographs."""
 
 BOUNDS: dict[str, tuple[float, float]] = {
@@ -58,7 +58,6 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "model.patch": (1, 64),
     "model.references": (1, 16),
     "model.octaves": (1, 16),
-    "model.joint_views": (1, 64),
     "model.unet.layers_per_block": (1, 16),
     "model.unet.heads": (1, 64),
     "model.projection_rate": (0, math.inf),
@@ -84,8 +83,6 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "sampler.steps": (1, 1000),
     "sampler.eta": (0, 1),
     "sampler.guidance": (0, 100),
-    "sampler.guidance_far": (0, 100),
-    "sampler.guidance_far_deg": (1, 180),
     "sampler.guidance_rescale": (0, 1),
     "complete.step_deg": (1, 180),
     "complete.edges": (1, 64),
@@ -105,7 +102,6 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "trainer.condition_dropout": (0, 1),
     "trainer.min_snr": (0.01, 1e6),
     "trainer.ema_decay": (0, 0.999999),
-    "average_width": (0.01, 0.28),
     "trainer.devices": (1, math.inf),
     "trainer.checkpoint_every": (1, math.inf),
     "trainer.validate_every": (1, math.inf),
@@ -135,7 +131,6 @@ def validate(config: TrainConfig | DataPrepConfig, tasks: tuple[str, ...]) -> No
         _check_model(config.model)
         if config.task in _ON_PAIRS:
             _check_pairs(config.model, config.prep)
-            _check_groups(config)
         _check_completion(config)
         _check_sampler_of(config)
         if config.lora.virtual_references == 1:
@@ -250,16 +245,6 @@ def _check_intervals(trainer: TrainerConfig) -> None:
         raise InputError(
             f"trainer.validate_every={trainer.validate_every} is no multiple of "
             f"trainer.checkpoint_every={trainer.checkpoint_every}: give one that is"
-        )
-
-
-def _check_groups(config: TrainConfig) -> None:
-    """A batch is made of whole groups of views."""
-    views, together = config.trainer.batch_size, config.model.joint_views
-    if views % together:
-        raise InputError(
-            f"trainer.batch_size={views} is no multiple of model.joint_views={together}: give one "
-            "that is"
         )
 
 

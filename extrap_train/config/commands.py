@@ -27,8 +27,6 @@ class TrainConfig(SceneOptions):
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
     validation: ValidationConfig = field(default_factory=ValidationConfig)
     complete: CompletionConfig = field(default_factory=CompletionConfig)
-    average_width: float = 0.1
-    """Of the averaged weights that `task=average` makes, in shares of the training."""
     task: str = "category"
     seed: int = 0
     run: str | None = None

@@ -58,12 +58,6 @@ class SamplerConfig:
     """Share of DDIM's noise that is drawn anew at every step; 0 is deterministic."""
     guidance: float = 1.0
     """Weight of the conditional prediction against the null condition's; 1 is no guidance."""
-    guidance_far: float | None = None
-    """Weight far from the inputs, to which `guidance` grows with the angle; null keeps it."""
-    guidance_far_deg: float = 90.0
-    """Angle between query and nearest reference from which on `guidance_far` holds."""
-    guidance_interval: list[float] = field(default_factory=lambda: [0.0, 1.0])
-    """Shares of the noise schedule, 0 clean to 1 pure noise, between which guidance acts."""
     guidance_rescale: float = 0.0
     """How far guidance's wider spread is taken back (Lin et al. 2023); they use 0.7."""
     compat: str | None = None
@@ -80,13 +74,10 @@ class SamplerOptions:
     steps: int | None = None
     eta: float | None = None
     guidance: float | None = None
-    guidance_far: float | None = None
-    guidance_far_deg: float | None = None
-    guidance_interval: list[float] | None = None
     guidance_rescale: float | None = None
     compat: str | None = None
     without: list[str] = field(default_factory=list)
-    """What the model recommends and is not wanted: `guidance_far`, `compat`."""
+    """What the model recommends and is not wanted: `compat`."""
 
     def over(self, recommended: SamplerConfig) -> SamplerConfig:
         """The model's recommendation with what is said here put over it.
@@ -94,7 +85,7 @@ class SamplerOptions:
         Asked for another solver than DDIM, it leaves out what is recommended for DDIM alone.
         """
         for name in self.without:
-            require_one_of("sampler.without", name, ("guidance_far", "compat"))
+            require_one_of("sampler.without", name, ("compat",))
         said = {name: value for name, value in vars(self).items() if value is not None}
         left_out: dict[str, Any] = dict.fromkeys(said.pop("without"))
         if said.get("solver", "ddim") != "ddim":
@@ -130,10 +121,6 @@ class ModelConfig:
     geometry: bool = False
     """Tell the denoiser the warp's depth and confidence, too; `ours` only: two more input channels,
     which start at zero upon weights without them, the packaged base's among them.
-    """
-    joint_views: int = 1
-    """Queries of one scene that are denoised together, attending to each other; 1 paints each
-    alone. Weights are the same and start from each other.
     """
     residual: bool = True
     """Denoise the difference to the hole-filled warp instead of the image itself: to the fused one,

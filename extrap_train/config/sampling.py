@@ -47,9 +47,3 @@ def check_sampler(sampler: SamplerConfig) -> None:
             f"sampler.solver={sampler.solver} is deterministic and none of the published runs: "
             "sampler.eta and sampler.compat need sampler.solver=ddim; without them, sampler.eta=0"
         )
-    interval = sampler.guidance_interval
-    if len(interval) != 2 or not 0 <= interval[0] <= interval[1] <= 1:
-        raise InputError(
-            f"sampler.guidance_interval={interval}: need [lowest,highest] with "
-            "0 ≤ lowest ≤ highest ≤ 1"
-        )

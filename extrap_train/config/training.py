@@ -25,10 +25,6 @@ class TrainerConfig:
     """
     ema_decay: float = 0.999
     """Of the averaged weights; 0 keeps no average, which saves their memory."""
-    power_averages: bool = False
-    """Keep snapshots from which `task=average` makes averaged weights of any length afterwards: at
-    most 16, of four bytes a trained weight.
-    """
     precision: str = "bf16-mixed"
     """Lightning's name of it: `bf16-mixed`, `16-mixed` or `32-true`."""
     gradient_checkpointing: bool = False

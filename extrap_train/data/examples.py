@@ -10,7 +10,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrap_train.data.prepared import PreparedData
-from extrap_train.errors import InputError
 from extrap_train.geometry.viewpoints import extra_references, pairwise_angles, scene_center
 from extrap_train.views import Camera, PairBatch, ViewPair, stack_cameras
 
@@ -83,20 +82,12 @@ def _flows(
 
 
 class ExampleReader:
-    """Examples of one split of one or several prepared categories.
+    """Examples of one split of one or several prepared categories."""
 
-    For a model that denoises `joint_views` together, training leaves out the pairs whose reference
-    has fewer queries than a group needs.
-    """
-
-    def __init__(
-        self, prepared: list[PreparedData], split: str, references: int, joint_views: int = 1
-    ) -> None:
-        self.references, self.joint_views = references, joint_views
+    def __init__(self, prepared: list[PreparedData], split: str, references: int) -> None:
+        self.references = references
         self._split = split
-        pairs = ((data, pair) for data in prepared for pair in data.pairs(split))
-        alone = joint_views == 1 or split != "train"
-        self._pairs = [(data, pair) for data, pair in pairs if alone or self._groups(data, pair)]
+        self._pairs = [(data, pair) for data in prepared for pair in data.pairs(split)]
         self._angles: dict[tuple[Path, str], np.ndarray] = {}
 
     def __len__(self) -> int:
@@ -112,51 +103,15 @@ class ExampleReader:
         data, pair = self._pairs[index]
         return float(self._angles_of(data, pair.sequence)[pair.query, pair.references[0]])
 
-    def read(self, index: int, count: int, rng: np.random.Generator) -> list[Example]:
-        """The pair's example with up to `count` references, of which those behind the first are
-        drawn; behind it the `joint_views − 1` views nearest to its query, from the same references.
-
-        In training these are queries of the same first reference. Nothing is measured on those of
-        the test split, where any frame will do that is no reference.
-        """
+    def read(self, index: int, count: int, rng: np.random.Generator) -> Example:
+        """The pair's example with up to `count` references; those after the first are drawn."""
         data, pair = self._pairs[index]
         references = self._references(data, pair, count, rng)
-        group = [self._example(data, pair.sequence, pair.query, references)]
-        angles = self._angles_of(data, pair.sequence)
-        for query in self._beside(data, pair, references, angles[pair.query]):
-            order = [r for r in references if r in self._candidates(data, pair.sequence, query)]
-            order.sort(key=lambda frame: (angles[query, frame], frame))
-            group.append(self._example(data, pair.sequence, query, order))
-        return group
+        return self._example(data, pair.sequence, pair.query, references)
 
     def collate(self, examples: list[Example]) -> PairBatch:
-        """A batch of whole groups with room for the reader's number of references."""
-        return replace(collate(examples, self.references), joint_views=self.joint_views)
-
-    def _groups(self, data: PreparedData, pair: ViewPair) -> bool:
-        """Whether its first reference has queries enough, whatever other references are drawn."""
-        queries = len(data.queries(pair.sequence, pair.references[0]))
-        return queries >= self.joint_views + self.references - 1
-
-    def _beside(
-        self,
-        data: PreparedData,
-        pair: ViewPair,
-        references: list[int],
-        angles_to_query: Float[np.ndarray, " n"],
-    ) -> list[int]:
-        """The `joint_views − 1` nearest frames to the pair's query."""
-        if self._split == "train":
-            known = data.queries(pair.sequence, pair.references[0]).tolist()
-        else:
-            known = list(range(len(angles_to_query)))
-        left = [frame for frame in known if frame not in (pair.query, *references)]
-        if len(left) < self.joint_views - 1:
-            raise InputError(
-                f"{pair.sequence}: {len(known)} frames are too few to denoise {self.joint_views} "
-                "together; give a smaller model.joint_views"
-            )
-        return sorted(left, key=lambda f: (angles_to_query[f], f))[: self.joint_views - 1]
+        """A batch with room for the reader's number of references."""
+        return collate(examples, self.references)
 
     def _references(
         self, data: PreparedData, pair: ViewPair, count: int, rng: np.random.Generator

@@ -94,14 +94,13 @@ class TrainingBatches(Dataset[PairBatch]):
         for position, pair in positions:
             rng = np.random.default_rng((self.seed, position))
             count = int(rng.integers(1, self.references + 1))
-            group = self.reader.read(pair, count, rng)
-            examples += [mirrored(example) for example in group] if rng.random() < 0.5 else group
+            example = self.reader.read(pair, count, rng)
+            examples.append(mirrored(example) if rng.random() < 0.5 else example)
         return self.reader.collate(examples)
 
 
 class ValidationBatches(Dataset[PairBatch]):
-    """The same examples, with all their references, every time; where views are denoised together,
-    each with its group behind it."""
+    """The same examples, with all their references, every time."""
 
     def __init__(
         self, reader: ExampleReader, chosen: list[int], size: int, references: int
@@ -113,18 +112,16 @@ class ValidationBatches(Dataset[PairBatch]):
         return len(self.batches)
 
     def __getitem__(self, index: int) -> PairBatch:
-        groups = [
-            self.reader.read(pair, self.references, np.random.default_rng(pair))
-            for pair in self.batches[index]
-        ]
-        return self.reader.collate([example for group in groups for example in group])
+        return self.reader.collate(
+            [
+                self.reader.read(pair, self.references, np.random.default_rng(pair))
+                for pair in self.batches[index]
+            ]
+        )
 
 
 class PairModule(lightning.LightningDataModule):
-    """Training and validation batches; the warp is made after the batch has reached its device.
-
-    `batch_size` counts views: where groups of them are denoised together, it holds fewer pairs.
-    """
+    """Training and validation batches; the warp is made after the batch has reached its device."""
 
     def __init__(
         self,
@@ -143,9 +140,9 @@ class PairModule(lightning.LightningDataModule):
         super().__init__()
         self.train, self.validation = train, validation
         self.image_size = image_size
-        self.pairs_a_batch = batch_size // train.joint_views
+        self.batch_size = batch_size
         self.batches_per_epoch = batches_per_epoch
-        self.validation_batch_size = max(1, validation_batch_size // validation.joint_views)
+        self.validation_batch_size = validation_batch_size
         self.references = references
         self.workers, self.seed = workers, seed
         self.chosen = spread(len(validation), validation_examples)
@@ -155,7 +152,7 @@ class PairModule(lightning.LightningDataModule):
         trainer = self.trainer
         sampler = PositionSampler(
             len(self.train),
-            self.pairs_a_batch,
+            self.batch_size,
             self.batches_per_epoch,
             self.seed,
             steps_done=lambda: trainer.global_step if trainer else 0,

@@ -35,24 +35,6 @@ def query_batch(
     return collate(examples, most_references), [tuple(row) for row in order.tolist()]
 
 
-def query_groups(queries: Camera, size: int) -> list[list[int]]:
-    """Queries that are denoised together: each in turn that has no group yet, with those nearest to
-    it of the others, `size` in all; the last group has what is left.
-
-    Raises InputError where a pose is degenerate.
-    """
-    _require_sound(queries)
-    nearest = references_by_nearness(queries, queries).tolist()
-    groups: list[list[int]] = []
-    left = dict.fromkeys(range(len(nearest)))
-    while left:
-        first = next(iter(left))
-        others = [query for query in nearest[first] if query in left and query != first]
-        groups.append([first, *others[: size - 1]])
-        left = {query: None for query in left if query not in groups[-1]}
-    return groups
-
-
 def _require_usable(references: Sequence[View], queries: Camera) -> None:
     if not references:
         raise InputError("there is no view to start from; give at least one posed photograph")

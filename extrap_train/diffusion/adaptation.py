@@ -19,7 +19,7 @@ from extrap_train.data.scene_pairs import AdaptationPairs
 from extrap_train.diffusion.conditioning import Conditioning
 from extrap_train.diffusion.loss import Anchor, Unchanged, diffusion_loss, prediction_errors
 from extrap_train.diffusion.model import ExtrapolationModel
-from extrap_train.diffusion.schedule import solver_of
+from extrap_train.diffusion.schedule import sampling_timesteps
 from extrap_train.errors import InputError
 from extrap_train.views import PairBatch, combine
 
@@ -79,7 +79,7 @@ def adapt(
     optimizer: Any = fabric.setup_optimizers(torch.optim.AdamW(trained, lr=rate, weight_decay=0.0))
     anchored = adapter.disable_adapter if options.virtual_references else None
     measure = _HeldOut(model, pairs.held_out_batch(), options.batch_size, sampler, fabric, anchored)
-    dropout = _CONDITION_DROPOUT if _is_guided(sampler) else 0.0
+    dropout = _CONDITION_DROPOUT if sampler.guidance != 1 else 0.0
     losses = [(0, measure())]
     if not math.isfinite(losses[0][1]):
         raise InputError(
@@ -124,10 +124,6 @@ def adapt(
     return Adaptation(losses, best_step, step, clock() - started, ended)
 
 
-def _is_guided(sampler: SamplerConfig) -> bool:
-    return sampler.guidance != 1 or sampler.guidance_far not in (None, 1)
-
-
 def _anchor(batch: PairBatch, unchanged: Unchanged | None) -> Anchor | None:
     if unchanged is None:
         return None
@@ -148,7 +144,7 @@ class _HeldOut:
         unchanged: Unchanged | None,
     ) -> None:
         self.model, self.fabric, self.unchanged = model, fabric, unchanged
-        levels = solver_of(model.schedule, sampler).timesteps
+        levels = sampling_timesteps(model.schedule, sampler)
         self.levels = levels[:: -(-len(levels) // _LEVELS)].to(fabric.device)
         self.draws = -(-_DRAWS // len(batch.image))
         places = torch.arange(len(batch.image)).split(most_at_once)

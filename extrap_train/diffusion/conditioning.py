@@ -42,8 +42,6 @@ class Conditioning:
     token_weight: Float[Tensor, " b"]
     """1; 0 where the token is plain zeros instead of a projected embedding."""
     null: Null = Null()
-    joint_views: int = 1
-    """So many consecutive queries are denoised together."""
 
     def zeroed(self, where: Bool[Tensor, " b"]) -> "Conditioning":
         """The null condition, the same in training and in sampling, for the chosen examples."""

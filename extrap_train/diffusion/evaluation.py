@@ -11,7 +11,7 @@ from torch import Tensor
 from extrap_train.config import SamplerConfig
 from extrap_train.diffusion.baselines import inpainted_warp, mean_filled_warp, nearest_reference
 from extrap_train.diffusion.model import ExtrapolationModel
-from extrap_train.diffusion.sampler import sample_views, view_generator
+from extrap_train.diffusion.sampler import sample_views
 from extrap_train.metrics import Distance, psnr, quantised, ssim
 from extrap_train.views import PairBatch, combine
 
@@ -41,17 +41,10 @@ def predict(
     sampler: SamplerConfig,
     seed: int,
 ) -> Iterator[Prediction]:
-    """The model's sample and the baselines for every batch; one seed per view, by its name.
-
-    Of views that are denoised together the first has the name, and it alone is predicted.
-    """
+    """The model's sample and the baselines for every batch; one seed per view, by its name."""
     for batch, names in batches:
-        beside = [f" beside {place}" if place else "" for place in range(batch.joint_views)]
-        generators = [view_generator(seed, name + place) for name in names for place in beside]
-        made = sample_views(model, batch, sampler, generators)
-        asked = batch.asked()
-        images = {"model": made[:: batch.joint_views], **baseline_images(asked)}
-        yield Prediction(asked, names, images)
+        made = sample_views(model, batch, sampler, names, seed)
+        yield Prediction(batch, names, {"model": made, **baseline_images(batch)})
 
 
 def score(prediction: Prediction, lpips: Distance | None) -> pd.DataFrame:

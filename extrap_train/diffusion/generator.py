@@ -1,7 +1,7 @@
 """The view from a pose: posed views with depth in, pictures at the queries out."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -10,11 +10,10 @@ from torch import Tensor
 
 from extrap_train.config import SamplerConfig
 from extrap_train.data.module import with_warp
-from extrap_train.data.queries import query_batch, query_groups
+from extrap_train.data.queries import query_batch
 from extrap_train.device import autocast
 from extrap_train.diffusion.model import ExtrapolationModel
-from extrap_train.diffusion.sampler import sample_views, view_generator
-from extrap_train.errors import InputError
+from extrap_train.diffusion.sampler import sample_views
 from extrap_train.views import Camera, View, Warp, combine
 
 
@@ -52,9 +51,8 @@ class ViewGenerator(Protocol):
         """Pictures of the queries (batched once), from views that have depth.
 
         A query's noise follows from `seed` and its name alone: the picture depends neither on the
-        queries beside it nor on their number, unless the model denoises several together. Raises
-        InputError for degenerate cameras, for views without depth, and where what is painted is not
-        finite.
+        other queries nor on their number. Raises InputError for degenerate cameras, for views
+        without depth, and where what is painted is not finite.
         """
         ...
 
@@ -88,40 +86,14 @@ class DiffusionGenerator:
         """See `ViewGenerator.generate`."""
         if len(names) != len(queries.world_to_cam):
             raise ValueError(f"{len(names)} names for {len(queries.world_to_cam)} queries")
-        batches = self._batches(queries)
-        parts = [
-            self._generate(
-                references, queries[torch.tensor(at)], [names[i] for i in at], seed, together
-            )
-            for at, together in batches
-        ]
-        order = torch.tensor([query for at, _ in batches for query in at]).argsort()
-        whole = combine(parts, lambda tensors: torch.cat(list(tensors))[order])
+        batches = [slice(at, at + self.batch_size) for at in range(0, len(names), self.batch_size)]
+        parts = [self._generate(references, queries[at], names[at], seed) for at in batches]
+        whole = combine(parts, lambda tensors: torch.cat(list(tensors)))
         chosen = [row for part in parts for row in part.references]
-        return GeneratedViews(
-            whole.images, whole.cameras, whole.warp, [chosen[place] for place in order.tolist()]
-        )
-
-    def _batches(self, queries: Camera) -> list[tuple[list[int], int]]:
-        """Which queries are denoised at a time, and how many of them together."""
-        together = self.model.config.joint_views
-        count = len(queries.world_to_cam)
-        groups = [[i] for i in range(count)] if together == 1 else query_groups(queries, together)
-        whole = [group for group in groups if len(group) == together]
-        size = max(1, self.batch_size // together)
-        batches = [
-            ([query for group in whole[at : at + size] for query in group], together)
-            for at in range(0, len(whole), size)
-        ]
-        return batches + [(group, len(group)) for group in groups[len(whole) :]]
+        return GeneratedViews(whole.images, whole.cameras, whole.warp, chosen)
 
     def _generate(
-        self,
-        references: Sequence[View],
-        queries: Camera,
-        names: Sequence[str],
-        seed: int,
-        joint_views: int,
+        self, references: Sequence[View], queries: Camera, names: Sequence[str], seed: int
     ) -> GeneratedViews:
         config = self.model.config
         size, most = config.warp_size, self.references or config.told_references
@@ -130,21 +102,8 @@ class DiffusionGenerator:
         with torch.autocast(device.type, enabled=False):
             batch, chosen = query_batch(references, queries, most, size)
             batch = with_warp(batch.to(device), config.image_size)
-        batch = replace(batch, joint_views=joint_views)
-        generators = [view_generator(seed, name) for name in names]
         with autocast(device, self.precision):
-            images = sample_views(self.model, batch, self.sampler, generators)
-        _require_finite(images, names)
+            images = sample_views(self.model, batch, self.sampler, names, seed)
         assert batch.warp is not None
         made = GeneratedViews(images, batch.camera, batch.warp, chosen)
         return combine([made], lambda tensors: tensors[0].cpu())
-
-
-def _require_finite(images: Float[Tensor, "n 3 h w"], names: Sequence[str]) -> None:
-    odd = (~images.isfinite()).flatten(1).any(1).nonzero().flatten().tolist()
-    if odd:
-        raise InputError(
-            f"view {names[odd[0]]}: what the model painted is not finite (NaN); either its weights "
-            "are not, as after a training that diverged: give other weights=, or numbers became "
-            "too large for trainer.precision: give 32-true"
-        )

@@ -35,19 +35,16 @@ def diffusion_loss(
     min_snr: float | None = None,
     anchor: Anchor | None = None,
 ) -> Float[Tensor, ""]:
-    """Mean squared error of the prediction at one random noise level per example, or per group of
-    views that are denoised together.
+    """Mean squared error of the prediction at one random noise level per example.
 
     Every random number comes from the (CPU) generator, so that a step is a function of its seed
     alone. `min_snr` weighs the levels, see `snr_weights`.
     """
     conditioning = model.condition(batch)
     target = model.encode_target(batch.image, conditioning, generator)
-    groups = len(target) // batch.joint_views
-    dropped = torch.rand(groups, generator=generator) < condition_dropout
+    dropped = torch.rand(len(target), generator=generator) < condition_dropout
     steps = model.schedule.config["num_train_timesteps"]
-    timestep = torch.randint(0, steps, (groups,), generator=generator).to(target.device)
-    dropped, timestep = (x.repeat_interleave(batch.joint_views) for x in (dropped, timestep))
+    timestep = torch.randint(0, steps, (len(target),), generator=generator).to(target.device)
     noise = torch.randn(target.shape, generator=generator).to(target)
     conditioning = conditioning.zeroed(dropped.to(target.device))
     errors = prediction_errors(model, target, noise, timestep, conditioning, anchor)

@@ -15,7 +15,6 @@ from torch.utils.weak import WeakIdKeyDictionary
 
 from extrap_train.config import LoraConfig, ModelConfig, TrainerConfig
 from extrap_train.device import is_out_of_memory
-from extrap_train.diffusion.averages import TRACKED_WIDTHS
 from extrap_train.diffusion.denoiser import build_unet
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError
@@ -100,7 +99,7 @@ def training_memory(model: ExtrapolationModel, options: TrainerConfig) -> Traini
     return TrainingMemory(
         weights=everything,
         optimizer=_ADAM_MOMENTS * trained,
-        average=trained * ((options.ema_decay > 0) + options.power_averages * len(TRACKED_WIDTHS)),
+        average=trained * (options.ema_decay > 0),
         step=_step_bytes(model.config, model.unet.config["in_channels"], options)
         if everything > GIB // 8
         else trained,

@@ -14,7 +14,6 @@ from extrap_train.diffusion.conditioning import Conditioning
 from extrap_train.diffusion.denoiser import build_unet
 from extrap_train.diffusion.family import FAMILIES
 from extrap_train.diffusion.image_encoder import ClipImageEncoder, build_image_encoder
-from extrap_train.diffusion.joint import JointAttention
 from extrap_train.diffusion.pose_encoding import POSE_CHANNELS
 from extrap_train.diffusion.schedule import noise_schedule
 from extrap_train.errors import InputError
@@ -40,8 +39,6 @@ class ExtrapolationModel(nn.Module):
             latent_channels,
             config.image_size // self.autoencoder.factor,
         )
-        if config.joint_views > 1:
-            self.unet.set_attn_processor(JointAttention())
         self.image_encoder = build_image_encoder(config)
         width = self.image_encoder.width
         self.cc_projection = nn.Linear(width + POSE_CHANNELS, config.unet.token_width)
@@ -70,16 +67,11 @@ class ExtrapolationModel(nn.Module):
                 f"views of {batch.camera.width} x {batch.camera.height} pixels, but the model was "
                 f"trained on {self.config.image_size} x {self.config.image_size}: resize them"
             )
-        if batch.joint_views > self.config.joint_views:
-            raise ValueError(
-                f"views in groups of {batch.joint_views} for a model that denoises "
-                f"{self.config.joint_views} together"
-            )
         latents, base = self.family.latents(batch, self.autoencoder, self.config)
         image = self.image_encoder(batch.reference_images[:, 0])
         embedding = torch.cat([image, self.family.pose(batch)], -1)
         whole = torch.ones_like(embedding[:, 0])
-        return Conditioning(latents, embedding, base, whole, self.null, batch.joint_views)
+        return Conditioning(latents, embedding, base, whole, self.null)
 
     def forward(
         self,
@@ -91,11 +83,7 @@ class ExtrapolationModel(nn.Module):
         token = self.cc_projection(conditioning.embedding)
         token = token * conditioning.token_weight[:, None].to(token.dtype)
         channels = torch.cat([noisy, conditioning.latents], 1)
-        views = conditioning.joint_views
-        together = {"joint_views": views} if views > 1 else None
-        return self.unet(
-            channels, timestep, token[:, None], cross_attention_kwargs=together
-        ).sample.float()
+        return self.unet(channels, timestep, token[:, None]).sample.float()
 
     def encode_target(
         self,

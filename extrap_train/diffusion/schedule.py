@@ -2,7 +2,6 @@
 the solvers that run it backwards.
 """
 
-import copy
 from typing import Any
 
 import torch
@@ -12,6 +11,8 @@ from torch import Tensor
 
 from extrap_train.config import ModelConfig, SamplerConfig, require_published
 
+MultistepSolver = Any
+"""One of the schedulers below; diffusers types none of their attributes."""
 _MULTISTEP = {"dpmpp": DPMSolverMultistepScheduler, "unipc": UniPCMultistepScheduler}
 
 
@@ -39,78 +40,48 @@ def noise_schedule(config: ModelConfig) -> DDIMScheduler:
     )
 
 
-class SpacedDdim:
-    """DDIM (Song et al. 2021) down any levels of a model's schedule: diffusers' step, on a schedule
-    of these levels alone.
-
-    Its own takes every step as 1000 // n levels long, wherever the denoiser is asked next: the
-    levels of 334 steps are 3 apart, and it would take away the noise of 2.
-    """
-
-    def __init__(self, schedule: DDIMScheduler, timesteps: Int[Tensor, " n"]) -> None:
-        self.timesteps = timesteps
-        self._steps = copy.deepcopy(schedule)
-        self._steps.alphas_cumprod = schedule.alphas_cumprod[timesteps.flip(0)]
-        self._steps.register_to_config(num_train_timesteps=len(timesteps))
-        self._steps.num_inference_steps = len(timesteps)
-
-    def step(
-        self,
-        prediction: Float[Tensor, "b z h w"],
-        timestep: Int[Tensor, ""],
-        latent: Float[Tensor, "b z h w"],
-        eta: float,
-        noise: Float[Tensor, "b z h w"] | None,
-    ) -> Float[Tensor, "b z h w"]:
-        """The latent at the next timestep, or without noise after the last; `noise` is for η."""
-        place = int((self.timesteps > timestep).sum())
-        last = len(self.timesteps) - 1
-        done = self._steps.step(prediction, last - place, latent, eta=eta, variance_noise=noise)
-        return done.prev_sample
-
-
-def ddim_timesteps(schedule: DDIMScheduler, count: int) -> Int[Tensor, " n"]:
-    """`count` timesteps even in time, from the noisiest down, where sampling starts.
+def ddim_timesteps(schedule: DDIMScheduler, config: SamplerConfig) -> Int[Tensor, " n"]:
+    """DDIM's timesteps, even in time, from the noisiest down, where sampling starts.
 
     Without zero terminal SNR 50 steps, and more that divide the schedule, start a stride below it,
     at 981 of 999, as ZeroNVS and MegaScenes were published ("leading"): fewer would start so far
-    below that the pure noise which they are given is none of theirs.
+    below that the pure noise which they are given is none of theirs. With `compat` the spacing is
+    the published one whatever the number, without the noisiest step; InputError where the model is
+    none of theirs.
     """
-    levels = schedule.config["num_train_timesteps"]
-    is_leading = schedule.config["timestep_spacing"] == "leading"
-    if is_leading and _FEWEST_LEADING <= count < levels and levels % count == 0:
-        return _leading(levels, count)
-    return torch.tensor([round(levels * (count - i) / count) - 1 for i in range(count)])
-
-
-def _leading(levels: int, count: int) -> Int[Tensor, " n"]:
-    return torch.arange(count - 1, -1, -1) * (levels // count) + 1
-
-
-def solver_of(schedule: DDIMScheduler, config: SamplerConfig) -> Any:
-    """The solver that walks down a model's noise levels, with its `timesteps` laid out.
-
-    `ddim` steps evenly in time (`ddim_timesteps`), with `compat` as published whatever the number,
-    the noisiest step left out; InputError where the model is none of theirs. The second-order ones,
-    DPM-Solver++(2M) (Lu et al. 2022) and UniPC (Zhao et al. 2023), step evenly in log-SNR down to
-    no noise at all, in which their error terms are written: even in time, their last step is so
-    long that it costs the whole gain.
-    """
+    count, levels = config.steps, schedule.config["num_train_timesteps"]
+    leading = torch.arange(count - 1, -1, -1) * (levels // count) + 1
     if config.compat is not None:
         kind, pure = schedule.config["prediction_type"], schedule.config["rescale_betas_zero_snr"]
         require_published(config, kind, zero_terminal_snr=pure)
-        levels = schedule.config["num_train_timesteps"]
-        return SpacedDdim(schedule, _leading(levels, config.steps)[1:])
-    if config.solver == "ddim":
-        return SpacedDdim(schedule, ddim_timesteps(schedule, config.steps))
+        return leading[1:]
+    is_leading = schedule.config["timestep_spacing"] == "leading"
+    if is_leading and _FEWEST_LEADING <= count < levels and levels % count == 0:
+        return leading
+    return torch.tensor([round(levels * (count - i) / count) - 1 for i in range(count)])
+
+
+def multistep_solver(schedule: DDIMScheduler, config: SamplerConfig) -> MultistepSolver:
+    """DPM-Solver++(2M) (Lu et al. 2022) or UniPC (Zhao et al. 2023) with its `timesteps` laid out.
+
+    They step evenly in log-SNR down to no noise at all, in which their error terms are written:
+    even in time, their last step is so long that it costs the whole gain.
+    """
     options = {key: schedule.config[key] for key in _SCHEDULE_KEYS}
-    solver: Any = _MULTISTEP[config.solver].from_config(options)
+    solver: MultistepSolver = _MULTISTEP[config.solver].from_config(options)
     solver.set_timesteps(config.steps)
     levels = even_in_log_snr(solver.alphas_cumprod, config.steps)
     alpha = solver.alphas_cumprod[levels]
     solver.timesteps = levels
     solver.sigmas = torch.cat([((1 - alpha) / alpha).sqrt(), torch.zeros(1)])
     return solver
+
+
+def sampling_timesteps(schedule: DDIMScheduler, config: SamplerConfig) -> Int[Tensor, " n"]:
+    """The timesteps at which sampling asks the denoiser, whatever the solver."""
+    if config.solver == "ddim":
+        return ddim_timesteps(schedule, config)
+    return multistep_solver(schedule, config).timesteps
 
 
 def even_in_log_snr(alphas_cumprod: Float[Tensor, " t"], count: int) -> Int[Tensor, " n"]:

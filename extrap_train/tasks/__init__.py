@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 TASKS = (
-    "average",
     "category",
     "complete",
     "pack",

@@ -17,7 +17,6 @@ from extrap_train.config import TrainConfig, placed
 from extrap_train.data.module import PairModule
 from extrap_train.data.prepared import PreparedData
 from extrap_train.device import require_accelerator
-from extrap_train.diffusion.averages import PowerAverages, snapshot_bytes
 from extrap_train.diffusion.callbacks import (
     AveragedWeights,
     EpochCheckpoints,
@@ -28,7 +27,7 @@ from extrap_train.diffusion.callbacks import (
 )
 from extrap_train.diffusion.checkpoint import initial_model, save_model
 from extrap_train.diffusion.layout import arranged
-from extrap_train.diffusion.memory import GIB, advice_where_memory_ends, training_memory
+from extrap_train.diffusion.memory import advice_where_memory_ends, training_memory
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.metrics import lpips_or_reason
@@ -64,8 +63,6 @@ def run(config: TrainConfig) -> Path:
     model = _model(config)
     if (needed := training_memory(model, config.trainer)).is_worth_a_word:
         console.print(f"{needed}")
-    if (most := snapshot_bytes(model, config.trainer)) > GIB:
-        console.print(f"disk needed: up to {most / GIB:.0f} GiB for trainer.power_averages")
     started = time.perf_counter()
     prepared = prepared_data(config)
     data = data_module(config, prepared)
@@ -207,7 +204,6 @@ def _trainer(config: TrainConfig, folder: RunFolder, checkpoint: str | None) -> 
         plugins=[WholeCheckpointIO()],
         callbacks=[
             *([AveragedWeights(options.ema_decay)] if options.ema_decay else []),
-            *([PowerAverages(folder.averages, epoch)] if options.power_averages else []),
             StepProgress(options.steps),
             _Pictures(folder.samples),
             EpochCheckpoints(folder.checkpoints),

@@ -30,15 +30,13 @@ def prepared_data(config: TrainConfig) -> list[PreparedData]:
 def data_module(config: TrainConfig, prepared: list[PreparedData]) -> PairModule:
     """Training and held-out pairs; InputError where there are none of either."""
     train, validation = (
-        ExampleReader(prepared, split, config.model.references, config.model.joint_views)
-        for split in ("train", "test")
+        ExampleReader(prepared, split, config.model.references) for split in ("train", "test")
     )
     for split, reader in (("training", train), ("test", validation)):
         if not len(reader):
-            together = " or give a smaller model.joint_views" * (config.model.joint_views > 1)
             raise InputError(
                 f"no {split} pairs for {config.category.name}: see the preparation's report, "
-                f"and loosen the options under prep{together}"
+                f"and loosen the options under prep"
             )
     return PairModule(
         train,

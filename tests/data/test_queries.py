@@ -7,7 +7,7 @@ import pytest
 import torch
 from orbits import even, looking_at, ring
 
-from extrap_train.data.queries import query_batch, query_groups
+from extrap_train.data.queries import query_batch
 from extrap_train.errors import InputError
 from extrap_train.geometry.viewpoints import references_by_nearness
 from extrap_train.views import Camera, View
@@ -71,15 +71,3 @@ def test_views_without_depth_and_no_views_at_all_are_refused():
         query_batch(flat, ring(even(3)), 3, 16)
     with pytest.raises(InputError, match="no view to start from"):
         query_batch([], ring(even(3)), 3, 16)
-
-
-def test_neighbours_are_denoised_together():
-    queries = ring(np.array([10.0, 60.0, 100.0, 14.0, 64.0, 12.0, 105.0]))
-    assert query_groups(queries, 3) == [[0, 5, 3], [1, 4, 2], [6]]
-    assert query_groups(queries, 1) == [[i] for i in range(7)]
-    assert query_groups(queries[:2], 4) == [[0, 1]]
-    twice = ring(np.array([30.0, 30.0, 30.0]))
-    assert query_groups(twice, 2) == [[0, 1], [2]]
-    queries.world_to_cam[3, 0, 0] = torch.nan
-    with pytest.raises(InputError, match="query 3: its camera is degenerate"):
-        query_groups(queries, 3)

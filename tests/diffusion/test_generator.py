@@ -81,24 +81,3 @@ def test_seed_and_name_choose_the_noise(config: ModelConfig) -> None:
 
 def test_it_is_a_view_generator(config: ModelConfig) -> None:
     assert isinstance(_generator(config, 1), ViewGenerator)
-
-
-def test_queries_denoised_together_come_back_in_their_order(config: ModelConfig) -> None:
-    """Neighbours share a group, whatever the order that they are asked for in; the last group is
-    what is left.
-    """
-    views = _views(ring(torch.tensor([0.0, 40.0, 80.0]).numpy()))
-    azimuths, names = torch.tensor([10.0, 60.0, 14.0, 64.0, 110.0]), ["a", "b", "c", "d", "e"]
-    joint = _generator(replace(config, joint_views=2), 3)
-    single = _generator(config, 8)
-    made = joint.generate(views, ring(azimuths.numpy()), names)
-    apart = single.generate(views, ring(azimuths.numpy()), names)
-    assert made.references == apart.references
-    assert torch.equal(made.warp.image, apart.warp.image)
-    assert torch.equal(made.cameras.world_to_cam, apart.cameras.world_to_cam)
-    moved = (made.images - apart.images).abs().amax((1, 2, 3))
-    assert moved[:4].min() > 1e-4
-    torch.testing.assert_close(made.images[4], apart.images[4], atol=1e-5, rtol=0)
-    order = torch.tensor([0, 2])
-    pair = joint.generate(views, ring(azimuths[order].numpy()), ["a", "c"])
-    torch.testing.assert_close(pair.images, made.images[order], atol=1e-5, rtol=0)

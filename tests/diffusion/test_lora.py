@@ -26,7 +26,7 @@ from extrap_train.diffusion.lora import (
 from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.memory import LiveBytes
 from extrap_train.diffusion.model import ExtrapolationModel
-from extrap_train.diffusion.sampler import sample_views, view_generator
+from extrap_train.diffusion.sampler import sample_views
 from extrap_train.errors import InputError
 from extrap_train.views import PairBatch
 
@@ -46,7 +46,7 @@ def _model(config: ModelConfig) -> ExtrapolationModel:
 
 
 def _painted(model: ExtrapolationModel, batch: PairBatch) -> Tensor:
-    return sample_views(model, batch, SamplerConfig(), [view_generator(0, n) for n in "abc"])
+    return sample_views(model, batch, SamplerConfig(), "abc")
 
 
 def _randomised(model: ExtrapolationModel) -> peft.PeftModel:

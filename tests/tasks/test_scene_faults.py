@@ -31,7 +31,7 @@ def broken(weights: Path, tmp_path: Path) -> Path:
 @pytest.mark.parametrize("task", [_VIEW, _SHORT, [*_SHORT, "inputs=null"]])
 def test_pictures_that_are_no_numbers_are_not_delivered(refused, broken, tmp_path, task) -> None:
     said = refused(*task, f"weights={broken}")
-    assert "not finite (NaN)" in said
+    assert "not finite" in said
     assert "give other weights=" in said
     assert not (tmp_path / task[0].removeprefix("task=") / "hydrant-0000").exists()
 

@@ -17,8 +17,8 @@ from extrap_train.diffusion.checkpoint import initial_model
 from extrap_train.diffusion.conditioning import Conditioning
 from extrap_train.diffusion.image_encoder import clip_input
 from extrap_train.diffusion.model import ExtrapolationModel
-from extrap_train.diffusion.sampler import sample_views
-from extrap_train.views import PairBatch, combine
+from extrap_train.diffusion.sampler import guided_denoiser, sample_ddim
+from extrap_train.diffusion.schedule import ddim_timesteps
 
 
 def assert_parity(ours: Tensor, expected: Tensor) -> None:
@@ -69,29 +69,7 @@ def test_a_drawn_latent_is_the_posterior_s(model: ExtrapolationModel, reference:
     assert_parity(drawn, reference.expected["vae_mean"] + spread * noise)
 
 
-class Prepared:
-    """The model with a condition that was prepared elsewhere; it keeps the last latent."""
-
-    def __init__(self, model: ExtrapolationModel, conditioning: Conditioning) -> None:
-        self.model, self.conditioning, self.schedule = model, conditioning, model.schedule
-
-    def condition(self, batch: PairBatch) -> Conditioning:
-        return self.conditioning
-
-    def __call__(self, noisy: Tensor, timestep: Tensor, conditioning: Conditioning) -> Tensor:
-        return self.model(noisy, timestep, conditioning)
-
-    def decode_target(self, latent: Tensor, conditioning: Conditioning) -> Tensor:
-        self.latent = latent
-        return latent[:, :3]
-
-
-def test_nine_steps_as_published(
-    model: ExtrapolationModel,
-    reference: Reference,
-    batch: PairBatch,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_nine_steps_as_published(model: ExtrapolationModel, reference: Reference) -> None:
     given = reference.expected
     condition = Conditioning(
         given["ddim_concat"],
@@ -102,15 +80,17 @@ def test_nine_steps_as_published(
     )
     visited = []
     model.unet.register_forward_pre_hook(lambda _, given_to: visited.append(int(given_to[1][0])))
-    monkeypatch.setattr(
-        "extrap_train.diffusion.sampler._noise", lambda like, generators: given["ddim_noise"]
-    )
     options = SamplerConfig(steps=10, eta=0.0, guidance=3.0, compat="megascenes")
-    prepared = Prepared(model, condition)
-    one = combine([batch], lambda tensors: tensors[0][:1])
-    sample_views(prepared, one, options, [])
+    with torch.no_grad():
+        latent = sample_ddim(
+            guided_denoiser(model, condition, options),
+            model.schedule,
+            ddim_timesteps(model.schedule, options),
+            options.eta,
+            lambda: given["ddim_noise"],
+        )
     assert sorted(visited) == sorted(given["ddim_timesteps"].tolist())
-    assert_parity(prepared.latent, given["ddim_latent"])
+    assert_parity(latent, given["ddim_latent"])
 
 
 def test_clip_sees_what_zero123_shows_it() -> None:

@@ -21,7 +21,7 @@ from extrap_train.__main__ import main
 from extrap_train.config import ModelConfig, SamplerConfig, TrainConfig, TrainerConfig
 from extrap_train.diffusion.checkpoint import initial_model, load_model, save_model
 from extrap_train.diffusion.loss import diffusion_loss
-from extrap_train.diffusion.sampler import sample_views, view_generator
+from extrap_train.diffusion.sampler import sample_views
 from extrap_train.diffusion.training import CategoryTraining
 
 _STEPS = 3
@@ -55,7 +55,7 @@ def _trains(config: ModelConfig, folder: Path) -> None:
     again = load_model(folder / "model").eval()
     assert torch.equal(again.unet.conv_in.weight, trained)
     options_of_sampling = SamplerConfig(steps=2, guidance=3.0)
-    image = sample_views(again, batch, options_of_sampling, [view_generator(0, "view")])
+    image = sample_views(again, batch, options_of_sampling, ["view"])
     assert image.shape == (1, 3, 256, 256)
     assert image.isfinite().all()
 
