@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 from typing import no_type_check
 
-import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from extrap_train.config import PrepConfig
+from extrap_train.geometry.compiled import compiled
 
 _TIE = 1e6
 """Scores are compared in steps of 1 / this, so that rounding never decides between equals."""
@@ -69,8 +69,8 @@ def _candidates(
     return first[order], second[order]
 
 
-@numba.njit(cache=True)
-@no_type_check  # numba compiles a bare function, none wrapped by the shape checker
+@compiled()
+@no_type_check
 def _greedy(first, second, near, max_uses):  # noqa: ANN001, ANN202
     """Which candidates, in their order, are taken."""
     count = len(near)

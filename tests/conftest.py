@@ -8,6 +8,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 import torch
+from shape_checks import check_shapes
+
+check_shapes()
 
 _MOST_WORKERS = 8  # each holds about 2 GiB
 

@@ -4,15 +4,15 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit
 
 from extrap_train.data.synthetic.vectors import Real
+from extrap_train.geometry.compiled import compiled
 
 _KEPT, _GONE = 0.25, 0.9
 """Footprint in wavelengths between which an octave fades, so that nothing aliases."""
 
 
-@njit(cache=True)
+@compiled()
 @no_type_check
 def _hash(x, y, z, seed):  # noqa: ANN001, ANN202
     """32 well-mixed bits of a lattice point."""
@@ -22,7 +22,7 @@ def _hash(x, y, z, seed):  # noqa: ANN001, ANN202
     return h ^ (h >> 15)
 
 
-@njit(cache=True)
+@compiled()
 @no_type_check
 def _slope(h, x, y, z):  # noqa: ANN001, ANN202
     """Dot product with one of Perlin's twelve edge gradients."""
@@ -32,7 +32,7 @@ def _slope(h, x, y, z):  # noqa: ANN001, ANN202
     return (a if h & 1 == 0 else -a) + (b if h & 2 == 0 else -b)
 
 
-@njit(cache=True)
+@compiled()
 @no_type_check
 def _perlin(x, y, z, seed):  # noqa: ANN001, ANN202
     """Perlin's improved noise (2002), about −0.9 … 0.9."""
@@ -49,7 +49,7 @@ def _perlin(x, y, z, seed):  # noqa: ANN001, ANN202
     return total
 
 
-@njit(cache=True)
+@compiled()
 @no_type_check
 def _fractal(points, footprint, frequency, octaves, seed):  # noqa: ANN001, ANN202
     out = np.empty(len(points), np.float32)

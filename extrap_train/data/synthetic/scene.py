@@ -8,12 +8,12 @@ import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Float, Int
-from numba import njit
 
 from extrap_train.data.synthetic.light import Light, ambient_light
 from extrap_train.data.synthetic.material import Material
 from extrap_train.data.synthetic.shapes import Mesh, Point, merge, moved
 from extrap_train.data.synthetic.vectors import Real
+from extrap_train.geometry.compiled import compiled
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def _embree(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -
     return scene
 
 
-@njit(cache=True)
+@compiled()
 @no_type_check
 def _interpolate(attributes, faces, face, u, v):  # noqa: ANN001, ANN202
     out = np.empty((len(face), attributes.shape[1]), np.float32)

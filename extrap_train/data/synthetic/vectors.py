@@ -4,12 +4,13 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit
+
+from extrap_train.geometry.compiled import compiled
 
 Real = int | float
 
 
-@njit(cache=True)
+@compiled()
 @no_type_check
 def _rotated(vectors, matrix):  # noqa: ANN001, ANN202
     out = np.empty_like(vectors)
@@ -20,7 +21,7 @@ def _rotated(vectors, matrix):  # noqa: ANN001, ANN202
     return out
 
 
-@njit(cache=True)
+@compiled()
 @no_type_check
 def _dot(a, b):  # noqa: ANN001, ANN202
     out = np.empty(len(a), a.dtype)
@@ -29,7 +30,7 @@ def _dot(a, b):  # noqa: ANN001, ANN202
     return out
 
 
-@njit(cache=True)
+@compiled()
 @no_type_check
 def _normalized(vectors):  # noqa: ANN001, ANN202
     out = np.empty_like(vectors)
