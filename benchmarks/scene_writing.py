@@ -1,6 +1,7 @@
 """Preparing a draw: its frames are read, their depth is found, and its folder is written."""
 
 import hashlib
+import logging
 import os
 import shutil
 from collections.abc import Mapping
@@ -19,11 +20,14 @@ from benchmarks.scenes import FORMAT, Scene
 from extrap_train.config import DatasetDepthConfig, DepthConfig, RulesConfig, StereoConfig
 from extrap_train.data.module import with_warp
 from extrap_train.data.queries import query_batch
+from extrap_train.depth import NoDepthError
 from extrap_train.depth.build import depth_source
 from extrap_train.errors import InputError
 from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
 from extrap_train.store.atomic import write_atomic
 from extrap_train.views import Camera, View, stack_cameras
+
+LOG = logging.getLogger(__name__)
 
 DEPTHS: Mapping[str, DepthConfig] = {"dataset": DatasetDepthConfig(), "stereo": StereoConfig()}
 
@@ -124,13 +128,18 @@ def _fine_scale(photographs: ListOf[View], rules: RulesConfig) -> int:
 def _with_depth(photographs: ListOf[View], depth_name: str, size: int) -> tuple[list[View], float]:
     """The inputs at a size with their depth, and how long finding it took.
 
-    Depth is found at its source's own resolution, from the inputs alone.
+    Depth is found at its source's own resolution, from the inputs alone. It is unknown everywhere,
+    with a warning, where the inputs stand too far apart: not every method needs it.
     """
     source = depth_source(DEPTHS[depth_name])
     side = max(size, source.image_size or 0)
     large = [view.squared(side) for view in photographs]
     with Stopwatch() as watch:
-        found = [depth.reliable() for depth in source.depth_maps(large)]
+        try:
+            found = [depth.reliable() for depth in source.depth_maps(large)]
+        except NoDepthError as error:
+            LOG.warning("%s", error)
+            found = [torch.zeros_like(view.image[0]) for view in large]
     views = []
     for view, depth in zip(large, found, strict=True):
         posed = View(view.image, view.camera, depth, name=view.name)

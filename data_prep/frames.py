@@ -16,7 +16,7 @@ from extrap_train.data.frame_files import SequenceFrames
 from extrap_train.data.images import to_eight_bits
 from extrap_train.data.paths import file_stamp
 from extrap_train.data.sequences import Sequence
-from extrap_train.depth import DepthSource
+from extrap_train.depth import DepthSource, NoDepthError
 from extrap_train.errors import InputError
 from extrap_train.views import View, stack_cameras
 
@@ -78,7 +78,10 @@ def make_frames(
         raise InputError(f"{where}: the masks are all black; remove them or the sequence")
     depths = torch.zeros(len(views), image_size, image_size)
     helping = (~held_out(len(views)) if lone else np.ones(len(views), bool)).nonzero()[0]
-    maps = depth_source.depth_maps([views[i] for i in helping])
+    try:
+        maps = depth_source.depth_maps([views[i] for i in helping])
+    except NoDepthError as error:
+        raise InputError(f"{where}: {error}") from None
     for index, found in zip(helping, maps, strict=True):
         depths[index] = block_median(found.reliable(), finer)
     views = [replace(view, depth=None).resized(image_size, image_size) for view in views]

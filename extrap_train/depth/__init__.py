@@ -11,11 +11,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from extrap_train.errors import InputError
 from extrap_train.geometry.cameras import transform, unproject
 from extrap_train.views import View
 
 RELIABLE_CONFIDENCE = 0.3
 """From here on a depth is to be used: about half of what lies below is wrong, little above."""
+
+
+class NoDepthError(InputError):
+    """No view of a capture has any depth, for a reason that lies in how the views were chosen."""
 
 
 @dataclass(frozen=True)
@@ -73,5 +78,8 @@ class DepthSource(Protocol):
         ...
 
     def depth_maps(self, views: Sequence[View]) -> list[DepthMap]:
-        """The depth of every view of one sequence; each finds its neighbours among the others."""
+        """The depth of every view of one sequence; each finds its neighbours among the others.
+
+        Views without any are named in one warning. InputError where none can have any.
+        """
         ...

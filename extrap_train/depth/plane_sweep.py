@@ -13,7 +13,7 @@ from extrap_train.depth.semi_global import semi_global_cost
 from extrap_train.views import View
 
 COARSEST_STEP = 2.0
-"""Most pixels between two planes in a neighbour: the sweep's image is as small as that asks."""
+"""Most pixels between two planes in a neighbour: the sweep's image is made as small as needed."""
 SMALLEST_SIDE = 64
 """The sweep's image keeps at least this many pixels on its longer side."""
 REFINEMENT_STEPS = 3
@@ -94,8 +94,10 @@ def _halvings(view: View, neighbours: list[View], step: float, bounds: tuple[flo
     """How often to halve the image so that neighbouring planes lie about a pixel apart."""
     longer = max(view.camera.height, view.camera.width)
     allowed = max(0, int(math.log2(longer / SMALLEST_SIDE)))
-    wanted = math.ceil(math.log2(_plane_spacing(view, neighbours, step, bounds) / COARSEST_STEP))
-    return min(max(wanted, 0), allowed)
+    spacing = _plane_spacing(view, neighbours, step, bounds)
+    if not 0 < spacing < math.inf:  # no neighbour sees the planes move: the matching says so
+        return 0
+    return min(max(math.ceil(math.log2(spacing / COARSEST_STEP)), 0), allowed)
 
 
 def _plane_spacing(

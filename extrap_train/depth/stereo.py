@@ -1,5 +1,7 @@
 """Depth by plane-sweep multi-view stereo (Collins, 1996) from photographs with known cameras."""
 
+import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -8,14 +10,22 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrap_train.config import StereoConfig
-from extrap_train.depth import DepthMap, PointMaps, point_maps_of
+from extrap_train.depth import DepthMap, NoDepthError, PointMaps, point_maps_of
 from extrap_train.depth.consistency import agreement, forward_backward_error
 from extrap_train.depth.depth_range import convergence_point, inverse_depth_range
-from extrap_train.depth.neighbours import neighbours_of
+from extrap_train.depth.neighbours import (
+    LEAST_RAD,
+    LIMIT_RAD,
+    nearest_angle_rad,
+    neighbours_of,
+)
 from extrap_train.depth.plane_sweep import Estimate, sweep
 from extrap_train.depth.resample import resampled
-from extrap_train.errors import InputError
 from extrap_train.views import View
+
+LOG = logging.getLogger(__name__)
+NAMED = 4
+"""Most views that a message names."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +48,11 @@ class PlaneSweepStereo:
     def depth_map(self, view: View, neighbours: Sequence[View]) -> DepthMap:
         """One view's depth; the neighbours' are computed too, for the consistency check.
 
-        InputError if no neighbour sees the scene from a useful angle.
+        NoDepthError if no neighbour sees the scene from a useful angle.
         """
         views = [view, *neighbours]
         helpers = self.neighbours(views)
-        _require_helpers(view, helpers[0])
+        _require_helpers(view, neighbours, helpers[0])
         for other in range(1, len(views)):
             rest = [i for i in helpers[other] if i != 0]
             helpers[other] = [0, *rest][: self.config.neighbours]
@@ -51,17 +61,38 @@ class PlaneSweepStereo:
     def depth_maps(self, views: Sequence[View]) -> list[DepthMap]:
         """Depth of every view of a capture; each is matched once and checked against others.
 
-        A view that no other one helps gets depth 0, unknown, everywhere.
+        A view that no other one helps gets depth 0, unknown, everywhere; one warning names these,
+        another those that are sure nowhere. NoDepthError where that is every view.
         """
-        return self._maps(list(views), self.neighbours(list(views)), wanted=range(len(views)))
+        helpers = self.neighbours(views)
+        alone = [view for view, others in zip(views, helpers, strict=True) if not others]
+        if alone and len(alone) == len(views):
+            raise NoDepthError(_without_neighbours(alone, views))
+        if alone:
+            LOG.warning("%s", _without_neighbours(alone, views))
+        maps = self._maps(list(views), helpers, wanted=range(len(views)))
+        unsure = [
+            view
+            for view, others, found in zip(views, helpers, maps, strict=True)
+            if others and not found.reliable().any()
+        ]
+        if unsure:
+            LOG.warning(
+                "depth=stereo finds no reliable depth for %d of %d views (%s): they show too "
+                "little texture, or other surfaces than their neighbours, or their poses are wrong",
+                len(unsure),
+                len(views),
+                _names(unsure),
+            )
+        return maps
 
     def point_maps(self, first: View, second: View) -> PointMaps:
         """Both views' points in the first camera's frame.
 
-        InputError if the two do not see the scene from usefully different angles.
+        NoDepthError if the two do not see the scene from usefully different angles.
         """
         helpers = self.neighbours([first, second])
-        _require_helpers(first, helpers[0])
+        _require_helpers(first, [second], helpers[0])
         one, two = self._maps([first, second], helpers, wanted=(0, 1))
         return point_maps_of(first, one, second, two)
 
@@ -106,12 +137,32 @@ class PlaneSweepStereo:
         return sweep(view, neighbours, bounds, self.config.planes)
 
 
-def _require_helpers(view: View, helpers: list[int]) -> None:
+def _require_helpers(view: View, others: Sequence[View], helpers: list[int]) -> None:
     if not helpers:
-        raise InputError(
-            f"{view.name or 'a view'}: no other view sees the scene from 3° to 45° beside it, "
-            "which depth=stereo needs; use depth=dataset or add photographs"
-        )
+        raise NoDepthError(_without_neighbours([view], [view, *others]))
+
+
+def _without_neighbours(alone: Sequence[View], views: Sequence[View]) -> str:
+    """One line: which views have no neighbour and so no depth, why, and what helps."""
+    least, most = (round(math.degrees(limit)) for limit in (LEAST_RAD, LIMIT_RAD))
+    nearest = nearest_angle_rad(views)
+    if nearest is not None and nearest > LIMIT_RAD:
+        why = f"; the nearest two views are {math.degrees(nearest):.0f}° apart"
+    elif len(views) > 1 and len(alone) == len(views):
+        why = "; the views stand in one place, or their poses are wrong"
+    else:
+        why = ""
+    return (
+        f"depth=stereo finds no depth for {len(alone)} of {len(views)} views ({_names(alone)}): no "
+        f"other view sees the scene from {least}° to {most}° beside them{why}; give more "
+        "photographs (inputs=), choose nearer ones (input_frames=), or use depth=dataset or a "
+        "learned source (depth=mast3r, depth=monocular)"
+    )
+
+
+def _names(views: Sequence[View]) -> str:
+    first = ", ".join(view.name or "a view" for view in views[:NAMED])
+    return first + (", …" if len(views) > NAMED else "")
 
 
 def _checked(
