@@ -1,6 +1,7 @@
 """How the kernels are compiled."""
 
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -36,11 +37,17 @@ def _compile_once(dispatcher: Any) -> None:
     two types, one could load the other's code.
     """
     compile_or_load = dispatcher.compile
-    lock = Path(dispatcher.stats.cache_path) / "numba.lock"
+    lock = _lock(dispatcher.stats.cache_path)
 
     def compile_alone(signature: Any) -> Any:
         # numba's own lock between threads first: kernels compile the kernels that they call.
-        with global_compiler_lock, FileLock(lock):
+        with global_compiler_lock, lock:
             return compile_or_load(signature)
 
     dispatcher.compile = compile_alone
+
+
+@cache
+def _lock(folder: str) -> FileLock:
+    """The folder's one lock, which whoever holds it may take again for the kernels within."""
+    return FileLock(Path(folder) / "numba.lock")

@@ -28,6 +28,11 @@ def test_a_compiled_kernel_is_read_from_disk(cache: Path) -> None:
     assert sum(second.stats.cache_hits.values()) == 1
 
 
+def test_kernels_that_call_each_other_are_compiled_together(cache: Path) -> None:
+    inner = compiled()(double)
+    assert compiled()(lambda number: inner(number) + 1)(3) == 7
+
+
 def test_a_kernel_waits_for_another_process_that_compiles(cache: Path) -> None:
     kernel = compiled()(double)
     caller = threading.Thread(target=kernel, args=(3,))
