@@ -139,11 +139,7 @@ def _reconfusion(config: CapturesConfig) -> list[Sequence]:
     folders = sorted(file.parent for file in Path(config.root).glob(f"*/{TRANSFORMS}"))
     if not folders:
         raise InputError(f"{config.root}: no folder in it has a {TRANSFORMS}; check captures.root")
-    return [replace(_by_name(read_transforms(f)), category="co3d", name=f.name) for f in folders]
-
-
-def _by_name(capture: Sequence) -> Sequence:
-    return replace(capture, frames=tuple(sorted(capture.frames, key=lambda frame: frame.name)))
+    return [replace(read_transforms(f), category="co3d", name=f.name) for f in folders]
 
 
 def _given_draws(config: CapturesConfig, capture: Sequence, rules: RulesConfig) -> list[Draw]:
@@ -170,13 +166,21 @@ def _given_draws(config: CapturesConfig, capture: Sequence, rules: RulesConfig) 
 
 
 def _frames_of(capture: Sequence, ids: list[Any]) -> tuple[str, ...]:
-    """The names of frames by their places; ValueError where those cannot be meant."""
-    wrong = [i for i in ids if type(i) is not int or not 0 <= i < len(capture.frames)]
+    """The names of frames by their places among all that are listed, in the order of names.
+
+    ValueError where those cannot be meant, or where the frame has no picture.
+    """
+    listed, present = sorted(capture.listed), {frame.name for frame in capture.frames}
+    wrong = [i for i in ids if type(i) is not int or not 0 <= i < len(listed)]
     if wrong:
-        raise ValueError(f"{wrong[0]!r} is no number from 0 to {len(capture.frames) - 1}")
+        raise ValueError(f"{wrong[0]!r} is no number from 0 to {len(listed) - 1}")
     if len(set(ids)) < len(ids):
         raise ValueError("a number stands twice")
-    return tuple(capture.frames[i].name for i in ids)
+    names = tuple(listed[i] for i in ids)
+    missing = [name for name in names if name not in present]
+    if missing:
+        raise ValueError(f"{missing[0]} is missing or cannot be used")
+    return names
 
 
 def _named(spec: str, categories: list[str]) -> Sequence:

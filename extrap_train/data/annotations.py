@@ -1,5 +1,7 @@
 """CO3D's annotation entries (v1 and v2) as typed records, their JSON checked."""
 
+import math
+import posixpath
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +14,12 @@ from extrap_train.errors import InputError
 from extrap_train.geometry.pytorch3d import NDC_FORMATS
 
 T = TypeVar("T")
+
+
+VIEWPOINT = {"R": (3, 3), "T": (3,), "focal_length": (2,), "principal_point": (2,)}
+"""The keys of a viewpoint and their shapes, in the order in which their numbers are kept."""
+_CHALLENGE_TARGET = "_unseen"
+"""What `meta.frame_type` then ends in."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,9 +42,11 @@ class FrameAnnotation:
     """(height, width) in pixels."""
     depth: DepthFiles | None
     mask_path: str | None
-    viewpoint: dict[str, Any] | None
-    """`R`, `T`, `focal_length`, `principal_point` as they stand in the file; not checked yet."""
+    viewpoint: tuple[float, ...] | None
+    """The numbers of `R`, `T`, `focal_length` and `principal_point`; they may make no sense."""
     intrinsics_format: str
+    is_challenge_target: bool
+    """Whether it is a target of CO3D's challenge, whose picture may have been blackened."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,9 +105,36 @@ def _frame(entry: Any, file: Path) -> FrameAnnotation:
         size=(height, width),
         depth=_depth(entry.get("depth"), file),
         mask_path=_optional_path(entry.get("mask"), "path", file),
-        viewpoint=viewpoint,
+        viewpoint=_viewpoint(viewpoint) if viewpoint else None,
         intrinsics_format=ndc,
+        is_challenge_target=_is_challenge_target(entry.get("meta")),
     )
+
+
+def _viewpoint(viewpoint: dict[str, Any]) -> tuple[float, ...]:
+    numbers: list[float] = []
+    for key, shape in VIEWPOINT.items():
+        value: Any = viewpoint.get(key)
+        rows: Any = value if len(shape) == 2 else [value]
+        try:
+            found = [[_number(number) for number in row] for row in rows]
+        except (TypeError, ValueError, OverflowError):
+            found = []
+        if [len(row) for row in found] != [shape[-1]] * math.prod(shape[:-1]):
+            expected = " x ".join(map(str, shape))
+            raise ValueError(f"the viewpoint has no {key} of {expected} numbers")
+        numbers.extend(number for row in found for number in row)
+    return tuple(numbers)
+
+
+def _number(value: Any) -> float:
+    """Truth values are no numbers: NaN, so that the entry is found degenerate."""
+    return math.nan if isinstance(value, bool) else float(value)
+
+
+def _is_challenge_target(meta: Any) -> bool:
+    kind = meta.get("frame_type") if isinstance(meta, dict) else None
+    return isinstance(kind, str) and kind.endswith(_CHALLENGE_TARGET)
 
 
 def _depth(entry: Any, file: Path) -> DepthFiles | None:
@@ -105,7 +142,7 @@ def _depth(entry: Any, file: Path) -> DepthFiles | None:
         return None
     return DepthFiles(
         path=_path(entry["path"], file),
-        scale=float(entry["scale_adjustment"]),
+        scale=_number(entry["scale_adjustment"]),
         mask_path=_optional_path(entry, "mask_path", file),
     )
 
@@ -121,7 +158,8 @@ def _sequence(entry: Any, file: Path) -> SequenceAnnotation:
 
 
 def _path(value: Any, file: Path) -> str:
-    return check_relative(_typed(value, str, "path"), file)
+    """The same file has the same path, however it is spelt."""
+    return posixpath.normpath(check_relative(_typed(value, str, "path"), file))
 
 
 def _optional_path(entry: Any, key: str, file: Path) -> str | None:

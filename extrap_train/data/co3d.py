@@ -19,7 +19,7 @@ from extrap_train.data.annotations import (
     read_frame_annotations,
     read_sequence_annotations,
 )
-from extrap_train.data.co3d_frames import Co3dFrames
+from extrap_train.data.co3d_frames import Co3dFrames, is_blackened
 from extrap_train.data.sequences import PointCloud, Sequence
 from extrap_train.errors import InputError, did_you_mean
 
@@ -61,6 +61,7 @@ def read_category(root: Path, category: str) -> list[Sequence]:
             # Popped: its parts go as soon as the sequence is made.
             _sequence(root, category, name, posed.pop(name), details.get(name), file)
             for name in sorted(posed)
+            if posed[name].parts
         ]
 
 
@@ -83,6 +84,8 @@ class _Posed:
     parts: list[Co3dFrames] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
     """Why each of the others is: their camera is degenerate."""
+    blackened: int = 0
+    """Hidden targets of the challenge, which are left out as known and not as damage."""
 
 
 def _posed_by_sequence(root: Path, file: Path) -> dict[str, _Posed]:
@@ -93,14 +96,18 @@ def _posed_by_sequence(root: Path, file: Path) -> dict[str, _Posed]:
         count += taken
     sound = sum(len(part) for sequence in posed.values() for part in sequence.parts)
     degenerate = [reason for sequence in posed.values() for reason in sequence.left_out]
-    without_camera = count - sound - len(degenerate)
+    blackened = sum(sequence.blackened for sequence in posed.values())
+    without_camera = count - sound - len(degenerate) - blackened
     if without_camera:
         log.warning("%s: %d frames have no camera and are left out", file, without_camera)
+    if blackened:
+        log.warning("%s: %d black frames, targets of the challenge, are left out", file, blackened)
     if not posed:
         raise InputError(f"{file}: no frame has a camera; choose another category")
     if not sound:
-        which = f"none of the {len(degenerate)} frames of {file.parent.name} can be used"
-        raise InputError(f"{which}, the first because of {degenerate[0]}")
+        which = f"none of the {count} frames of {file.parent.name} can be used"
+        why = f"the first because of {degenerate[0]}" if degenerate else "all of them are black"
+        raise InputError(f"{which}, {why}; choose another category")
     if degenerate:
         log.warning("%d frames are left out, the first: %s", len(degenerate), degenerate[0])
     return posed
@@ -114,7 +121,11 @@ def _take(
     count = 0
     for annotation in entries:
         count += 1
-        if annotation.viewpoint is not None:
+        if annotation.viewpoint is None:
+            continue
+        if is_blackened(root, annotation):
+            posed[annotation.sequence].blackened += 1
+        else:
             by_sequence[annotation.sequence].append(annotation)
     for name, annotations in by_sequence.items():
         part, left_out = Co3dFrames.of(root, annotations, file)

@@ -20,10 +20,15 @@ from extrap_train.data.images import (
     read_photograph,
     read_sixteen_bit,
 )
-from extrap_train.data.paths import resolve_inside
+from extrap_train.data.paths import file_stamp, require_file
 from extrap_train.data.sequences import Frame
 from extrap_train.data.validation import degenerate_camera
+from extrap_train.errors import InputError
 from extrap_train.views import Camera, View
+
+MAX_DEPTH_SCALE = 1e6
+"""Of CO3D's depth maps, whose units differ from its cameras'; a larger one is damage."""
+_JPEG_HEADER_BYTES, _BLACK_PIXELS_PER_BYTE = 1024, 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,9 +52,9 @@ class _Photograph:
 
     def load(self, *, depth: bool = True) -> View:
         size = self.camera.height, self.camera.width
-        mask_path = self.mask_path and resolve_inside(self.root, self.mask_path)
-        image_path = resolve_inside(self.root, self.image_path)
-        image, mask = read_photograph(image_path, size, mask_path or None)
+        mask_path = require_file(self.root / self.mask_path) if self.mask_path else None
+        image_path = require_file(self.root / self.image_path)
+        image, mask = read_photograph(image_path, size, mask_path)
         return View(
             image=image,
             camera=self.camera,
@@ -63,8 +68,8 @@ class _Photograph:
 class Co3dFrames(ListOf[Frame]):
     """Some frames of one sequence; each is made when it is asked for.
 
-    Columns with a row a frame, about 350 bytes instead of the 7,000 of as many small objects. Paths
-    are the system's bytes, empty where there is no file.
+    Columns with one row per frame, about 350 bytes instead of the 7,000 of as many small objects.
+    Paths are the system's bytes, empty where there is no file.
     """
 
     root: Path
@@ -84,7 +89,7 @@ class Co3dFrames(ListOf[Frame]):
         cls, root: Path, annotations: list[FrameAnnotation], file: Path
     ) -> tuple["Co3dFrames", tuple[str, ...]]:
         """In the annotations' order, and why some are left out: their camera is degenerate."""
-        cameras = cameras_of(annotations, file)
+        cameras = cameras_of(annotations)
         frames = cls._of(root, annotations, cameras)
         if cameras.sound.all():
             return frames, ()
@@ -179,13 +184,28 @@ class Co3dFrames(ListOf[Frame]):
         )
 
 
+def is_blackened(root: Path, annotation: FrameAnnotation) -> bool:
+    """Whether a frame is a hidden target of CO3D's challenge: black, with the true camera.
+
+    Those of later releases and of the development sets are photographs. A black JPEG takes a
+    64th of a byte per pixel, a photograph a tenth at least, so that none has to be decoded.
+    """
+    if not annotation.is_challenge_target:
+        return False
+    stamp = file_stamp(root / annotation.image_path)
+    height, width = annotation.size
+    return stamp is None or stamp[0] < _JPEG_HEADER_BYTES + height * width / _BLACK_PIXELS_PER_BYTE
+
+
 def _encoded(paths: Iterable[str | None]) -> Shaped[np.ndarray, " n"]:
     return np.array([os.fsencode(path or "") for path in paths])
 
 
 def _read_depth(root: Path, files: DepthFiles, size: tuple[int, int]) -> Float[Tensor, "h w"]:
-    path = resolve_inside(root, files.path)
+    path = require_file(root / files.path)
+    if files.scale > MAX_DEPTH_SCALE:
+        raise InputError(f"{path}: the scale of its depth is {files.scale}; correct its entry")
     depth = known_depth(read_sixteen_bit(path, size).view(np.float16), files.scale, path)
     if files.mask_path:
-        depth *= read_depth_mask(resolve_inside(root, files.mask_path), size)
+        depth *= read_depth_mask(require_file(root / files.mask_path), size)
     return depth

@@ -1,46 +1,44 @@
 """COLMAP's `cameras.bin` and `images.bin` (little-endian); no size they state is trusted."""
 
+import os
 import struct
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, NoReturn
 
-from extrap_train.data.colmap_records import (
-    ModelCamera,
-    ModelImage,
-    find_camera_model,
-    make_camera,
-)
+from extrap_train.data.colmap_records import PARAMETERS, ModelCamera, ModelImage
+from extrap_train.data.paths import MAX_PATH_BYTES
 from extrap_train.errors import InputError
 
 POINT_2D_BYTES = 24
 """x, y and the number of the point in space, 8 bytes each."""
 
 
-@dataclass
 class _Cursor:
-    """Walks through a file's content; running past its end is an InputError."""
+    """Walks through a file; running past its end is an InputError. Points are never in memory."""
 
-    content: bytes
-    file: Path
-    position: int = 0
+    def __init__(self, stream: IO[bytes], file: Path) -> None:
+        self.stream, self.file = stream, file
+        self.length = os.fstat(stream.fileno()).st_size
 
     def read(self, layout: str) -> tuple[Any, ...]:
-        size = struct.calcsize("<" + layout)
-        self.skip(size)
-        return struct.unpack_from("<" + layout, self.content, self.position - size)
+        content = self.stream.read(struct.calcsize("<" + layout))
+        if len(content) < struct.calcsize("<" + layout):
+            self._truncated()
+        return struct.unpack("<" + layout, content)
 
     def skip(self, size: int) -> None:
-        self.position += size
-        if self.position > len(self.content):
+        if size > self.length - self.stream.tell():
             self._truncated()
+        self.stream.seek(size, os.SEEK_CUR)
 
     def read_name(self) -> str:
-        end = self.content.find(b"\0", self.position)
-        if end < 0:
+        start = self.stream.tell()
+        name, end, _ = self.stream.read(MAX_PATH_BYTES + 1).partition(b"\0")
+        if not end:
             self._truncated()
-        name = self.content[self.position : end]
-        self.position = end + 1
+        self.stream.seek(start + len(name) + 1)
         try:
             return name.decode()
         except UnicodeDecodeError:
@@ -48,32 +46,48 @@ class _Cursor:
                 f"{self.file}: has a picture name that is not UTF-8; export the model again"
             ) from None
 
-    def _truncated(self) -> None:
+    def _truncated(self) -> NoReturn:
         raise InputError(f"{self.file}: is truncated or damaged; export the model again")
+
+
+def count_binary_images(file: Path) -> int:
+    """How many images an `images.bin` says it has."""
+    with _opened(file) as cursor:
+        return int(cursor.read("Q")[0])
 
 
 def read_binary_cameras(file: Path) -> list[ModelCamera]:
     """Every camera of a `cameras.bin`."""
-    cursor = _Cursor(file.read_bytes(), file)
-    (count,) = cursor.read("Q")
     cameras = []
-    for _ in range(count):
-        number, model_number, width, height = cursor.read("iiQQ")
-        model = find_camera_model(model_number, file)
-        values = cursor.read(f"{len(model.parameters)}d")
-        cameras.append(make_camera(number, model, height, width, values, file))
+    with _opened(file) as cursor:
+        (count,) = cursor.read("Q")
+        for _ in range(count):
+            number, model, width, height = cursor.read("iiQQ")
+            if model not in PARAMETERS:
+                raise InputError(
+                    f"{file}: camera {number} is of a model that has the number {model}, and the "
+                    "models known here end at 17; run COLMAP's image_undistorter first"
+                )
+            parameters = cursor.read(f"{PARAMETERS[model]}d")
+            cameras.append(ModelCamera(number, model, height, width, parameters))
     return cameras
 
 
 def read_binary_images(file: Path) -> list[ModelImage]:
     """Every image of an `images.bin`; the points that it shows are skipped."""
-    cursor = _Cursor(file.read_bytes(), file)
-    (count,) = cursor.read("Q")
     images = []
-    for _ in range(count):
-        _number, *pose, camera = cursor.read("i7di")
-        name = cursor.read_name()
-        (points,) = cursor.read("Q")
-        cursor.skip(points * POINT_2D_BYTES)
-        images.append(ModelImage(name, camera, tuple(pose[:4]), tuple(pose[4:])))
+    with _opened(file) as cursor:
+        (count,) = cursor.read("Q")
+        for _ in range(count):
+            _number, *pose, camera = cursor.read("i7di")
+            name = cursor.read_name()
+            (points,) = cursor.read("Q")
+            cursor.skip(points * POINT_2D_BYTES)
+            images.append(ModelImage(name, camera, tuple(pose[:4]), tuple(pose[4:])))
     return images
+
+
+@contextmanager
+def _opened(file: Path) -> Iterator[_Cursor]:
+    with file.open("rb") as stream:
+        yield _Cursor(stream, file)

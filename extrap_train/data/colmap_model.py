@@ -1,57 +1,109 @@
-"""COLMAP's sparse models, text and binary: cameras and images; points in space are not needed."""
+"""COLMAP's sparse models, text and binary: cameras and images; points in space are not needed.
 
+Read here and not by pycolmap, which trusts the counts that a file states: the files may come from
+anywhere, and only cameras and poses are needed of them.
+"""
+
+import logging
+from functools import partial
 from pathlib import Path
 
 import torch
 
-from extrap_train.data.colmap_binary import read_binary_cameras, read_binary_images
+from extrap_train.data.camera_check import COLMAP_POSES
+from extrap_train.data.colmap_binary import (
+    count_binary_images,
+    read_binary_cameras,
+    read_binary_images,
+)
 from extrap_train.data.colmap_records import ModelCamera, ModelImage
-from extrap_train.data.colmap_text import read_text_cameras, read_text_images
+from extrap_train.data.colmap_text import count_text_images, read_text_cameras, read_text_images
+from extrap_train.data.listed_files import ListedFiles
 from extrap_train.data.paths import check_relative
-from extrap_train.data.photographs import Photograph, present_pictures, sequence_of_photographs
+from extrap_train.data.photographs import Listed, Photograph, sequence_of_photographs
 from extrap_train.data.sequences import PointCloud, Sequence
 from extrap_train.errors import InputError
 from extrap_train.geometry.colmap import world_to_cam_from_colmap
 
 POINT_CLOUD = "points3D.ply"
 """Some tools leave one beside the model."""
+_KINDS = ("bin", "txt")
+
+log = logging.getLogger(__name__)
 
 
 def find_model(folder: Path) -> Path | None:
-    """The folder with the model files: `folder` itself, its `sparse/0` or its `sparse`."""
-    for candidate in (folder, folder / "sparse" / "0", folder / "sparse"):
-        if any((candidate / f"images.{kind}").is_file() for kind in ("bin", "txt")):
-            return candidate
-    return None
+    """The folder with the model files: `folder` itself, the largest in its `sparse`, or `sparse`.
+
+    COLMAP's mapper leaves one model for each part of the photographs that it could connect. Those
+    that are not taken are named in a warning.
+    """
+    if _images_file(folder):
+        return folder
+    sparse = folder / "sparse"
+    parts = sorted(path for path in sparse.glob("*") if _images_file(path))
+    if not parts:
+        return sparse if _images_file(sparse) else None
+    if len(parts) == 1:
+        return parts[0]
+    counts = {part: _count_images(part) for part in parts}
+    largest = max(parts, key=lambda part: counts[part])
+    others = [f"{part.name} has {counts[part]}" for part in parts if part != largest]
+    log.warning(
+        "%s: holds %d models, of which %s with %d pictures is read (%s); name another with "
+        "scene=%s/NUMBER",
+        sparse,
+        len(parts),
+        largest.name,
+        counts[largest],
+        ", ".join(others[:4]),
+        sparse,
+    )
+    return largest
 
 
 def read_model(model: Path, images: Path, name: str) -> Sequence:
     """The capture of a COLMAP model; `images` is the folder that its picture names start from.
 
-    Distortion is undone when a frame is read. Entries without a picture are left out with one
-    warning.
+    Distortion is undone when a frame is read. Entries without a picture, and those with a camera
+    that cannot be used, are left out.
     """
-    kind = "bin" if (model / "images.bin").is_file() else "txt"
-    cameras_file, images_file = model / f"cameras.{kind}", model / f"images.{kind}"
+    images_file = _images_file(model) or model / "images.bin"
+    cameras_file = model / f"cameras{images_file.suffix}"
     for file in (cameras_file, images_file):
         if not file.is_file():
             raise InputError(f"{file}: no such file; export the whole COLMAP model")
-    if kind == "bin":
+    if images_file.suffix == ".bin":
         cameras, entries = read_binary_cameras(cameras_file), read_binary_images(images_file)
     else:
         cameras, entries = read_text_cameras(cameras_file), read_text_images(images_file)
     if not entries:
         raise InputError(f"{images_file}: lists no picture; run COLMAP again")
-    paths = [check_relative(entry.name, images_file) for entry in entries]
-    present = present_pictures(images, paths, images_file)
     by_number = _by_number(cameras, cameras_file)
+    listed = [
+        Listed(
+            check_relative(entry.name, images_file),
+            partial(_photograph, entry, by_number, cameras_file),
+        )
+        for entry in entries
+    ]
+    cloud = PointCloud(model, POINT_CLOUD)
     return sequence_of_photographs(
-        images,
-        name,
-        [_photograph(entry, by_number, images_file) for entry in entries if entry.name in present],
-        images_file,
-        point_cloud=PointCloud(model, POINT_CLOUD),
+        ListedFiles(images), name, listed, images_file, COLMAP_POSES, point_cloud=cloud
     )
+
+
+def _images_file(folder: Path) -> Path | None:
+    """The file that lists a model's images, in binary before text; None where there is none."""
+    files = (folder / f"images.{kind}" for kind in _KINDS)
+    return next((file for file in files if file.is_file()), None)
+
+
+def _count_images(model: Path) -> int:
+    file = _images_file(model)
+    if file is None:
+        return 0
+    return count_binary_images(file) if file.suffix == ".bin" else count_text_images(file)
 
 
 def _by_number(cameras: list[ModelCamera], file: Path) -> dict[int, ModelCamera]:
@@ -63,7 +115,9 @@ def _by_number(cameras: list[ModelCamera], file: Path) -> dict[int, ModelCamera]
     return found
 
 
-def _photograph(entry: ModelImage, cameras: dict[int, ModelCamera], file: Path) -> Photograph:
+def _photograph(
+    entry: ModelImage, cameras: dict[int, ModelCamera], file: Path, path: str
+) -> Photograph:
     if entry.camera not in cameras:
         raise InputError(
             f"{file}: {entry.name} names camera {entry.camera}, which the model does not have; "
@@ -73,9 +127,9 @@ def _photograph(entry: ModelImage, cameras: dict[int, ModelCamera], file: Path) 
     quaternion = torch.tensor(entry.quaternion_wxyz, dtype=torch.float64)
     translation = torch.tensor(entry.translation, dtype=torch.float64)
     return Photograph(
-        image_path=entry.name,
+        image_path=path,
         height=camera.height,
         width=camera.width,
-        lens=camera.lens,
+        lens=camera.lens(file),
         world_to_cam=world_to_cam_from_colmap(quaternion, translation),
     )

@@ -1,22 +1,51 @@
 """What COLMAP's model files hold, as far as it is needed: the same for text and binary files."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from extrap_train.errors import InputError
-from extrap_train.geometry.colmap import CAMERA_MODELS, CameraModel, lens_from_parameters
+from extrap_train.geometry.colmap import CAMERA_MODELS, OTHER_MODELS, lens_from_parameters
 from extrap_train.geometry.lens import Lens
+
+PARAMETERS = {model.number: len(model.parameters) for model in CAMERA_MODELS} | {
+    number: count for number, (_, count) in OTHER_MODELS.items()
+}
+"""How many there are, by the number of the camera model."""
+_NAMES = {number: name for number, (name, _) in OTHER_MODELS.items()}
 
 
 @dataclass(frozen=True)
 class ModelCamera:
-    """An entry of `cameras.txt` or `cameras.bin`."""
+    """An entry of `cameras.txt` or `cameras.bin`, which may be of any model."""
 
     number: int
+    model: str | int
+    """Its name, or its number as a binary file has it."""
     height: int
     width: int
-    lens: Lens
+    parameters: tuple[float, ...]
+
+    def lens(self, file: Path) -> Lens:
+        """InputError where the model cannot be undone or the entry makes no sense."""
+        for model in CAMERA_MODELS:
+            if self.model in (model.name, model.number):
+                break
+        else:
+            name = _NAMES.get(self.model, self.model) if isinstance(self.model, int) else self.model
+            raise InputError(
+                f"{file}: camera {self.number} is of the model {name}, and only "
+                f"{', '.join(m.name for m in CAMERA_MODELS)} can be undone; run COLMAP's "
+                "image_undistorter first"
+            )
+        count = len(self.parameters)
+        if count != len(model.parameters) or self.height <= 0 or self.width <= 0:
+            raise InputError(
+                f"{file}: camera {self.number} ({model.name}) has {count} parameters and size "
+                f"{self.height} x {self.width}, expected {len(model.parameters)} of them; export "
+                "the model again"
+            )
+        named = dict(zip(model.parameters, self.parameters, strict=True))
+        return lens_from_parameters(named, model.fisheye)
 
 
 @dataclass(frozen=True)
@@ -27,27 +56,3 @@ class ModelImage:
     camera: int
     quaternion_wxyz: tuple[float, ...]
     translation: tuple[float, ...]
-
-
-def find_camera_model(key: str | int, file: Path) -> CameraModel:
-    """A camera model by its name or number; raises InputError for those that cannot be undone."""
-    for model in CAMERA_MODELS:
-        if key in (model.name, model.number):
-            return model
-    raise InputError(
-        f"{file}: camera model {key} is none of {', '.join(m.name for m in CAMERA_MODELS)}; "
-        "run COLMAP's image_undistorter first"
-    )
-
-
-def make_camera(
-    number: int, model: CameraModel, height: int, width: int, values: Sequence[float], file: Path
-) -> ModelCamera:
-    """A camera from its parameters in the model's order."""
-    if len(values) != len(model.parameters) or height <= 0 or width <= 0:
-        raise InputError(
-            f"{file}: camera {number} ({model.name}) has {len(values)} parameters and size "
-            f"{height} x {width}, expected {len(model.parameters)} of them; export the model again"
-        )
-    named = dict(zip(model.parameters, values, strict=True))
-    return ModelCamera(number, height, width, lens_from_parameters(named, model.fisheye))

@@ -1,15 +1,19 @@
 """COLMAP's `cameras.txt` and `images.txt`."""
 
 from collections.abc import Iterator
+from itertools import dropwhile
 from pathlib import Path
 
-from extrap_train.data.colmap_records import (
-    ModelCamera,
-    ModelImage,
-    find_camera_model,
-    make_camera,
-)
+from extrap_train.data.colmap_records import ModelCamera, ModelImage
 from extrap_train.errors import InputError
+
+MAX_LINE_CHARACTERS = 2**24
+"""A line of points takes about twenty for each."""
+
+
+def count_text_images(file: Path) -> int:
+    """How many images an `images.txt` has: about, where it is damaged."""
+    return (sum(1 for _ in _lines(file)) + 1) // 2
 
 
 def read_text_cameras(file: Path) -> list[ModelCamera]:
@@ -21,11 +25,10 @@ def read_text_cameras(file: Path) -> list[ModelCamera]:
             continue
         try:
             identity, width, height = int(fields[0]), int(fields[2]), int(fields[3])
-            values = [float(field) for field in fields[4:]]
+            parameters = tuple(float(field) for field in fields[4:])
         except (IndexError, ValueError):
             raise _malformed(file, number) from None
-        model = find_camera_model(fields[1], file)
-        cameras.append(make_camera(identity, model, height, width, values, file))
+        cameras.append(ModelCamera(identity, fields[1], height, width, parameters))
     return cameras
 
 
@@ -34,28 +37,33 @@ def read_text_images(file: Path) -> list[ModelImage]:
 
     The second line lists the points that the image shows and may be empty.
     """
-    lines = list(_lines(file))
-    while lines and not lines[0][1].strip():
-        lines.pop(0)
-    while lines and not lines[-1][1].strip():
-        lines.pop()
-    images = []
-    for number, line in lines[1::2]:
-        if _is_image(line):
+    images: list[ModelImage] = []
+    is_image, blank = True, 0
+    for number, line in dropwhile(lambda numbered: not numbered[1].strip(), _lines(file)):
+        if not is_image and _is_image(line):
             raise InputError(
                 f"{file}: line {number} is an image where the points of the one before are "
                 "expected, on a line that may be empty; export the model again"
             )
-    for number, line in lines[::2]:
-        # A name may hold spaces.
-        fields = line.split(maxsplit=9)
-        try:
-            pose = tuple(float(field) for field in fields[1:8])
-            camera, name = int(fields[8]), fields[9].strip()
-        except (IndexError, ValueError):
-            raise _malformed(file, number) from None
-        images.append(ModelImage(name, camera, pose[:4], pose[4:]))
+        if is_image and line.strip():
+            if blank:
+                raise _malformed(file, number - 1)
+            images.append(_image(line, number, file))
+        elif is_image:  # allowed at the end alone
+            blank += 1
+            continue
+        is_image = not is_image
     return images
+
+
+def _image(line: str, number: int, file: Path) -> ModelImage:
+    # A name may hold spaces.
+    fields = line.split(maxsplit=9)
+    try:
+        pose = tuple(float(field) for field in fields[1:8])
+        return ModelImage(fields[9].strip(), int(fields[8]), pose[:4], pose[4:])
+    except (IndexError, ValueError):
+        raise _malformed(file, number) from None
 
 
 def _is_image(line: str) -> bool:
@@ -73,14 +81,20 @@ def _is_number(word: str) -> bool:
 
 
 def _lines(file: Path) -> Iterator[tuple[int, str]]:
-    """Numbered lines without the comments."""
+    """Numbered lines without the comments, one at a time."""
+    number = 0
     try:
-        content = file.read_text(encoding="utf-8")
+        with file.open(encoding="utf-8-sig") as stream:
+            while line := stream.readline(MAX_LINE_CHARACTERS):
+                number += 1
+                if len(line) == MAX_LINE_CHARACTERS:
+                    raise InputError(f"{file}: line {number} has no end; export the model again")
+                if not line.startswith("#"):
+                    yield number, line
     except UnicodeDecodeError:
         raise InputError(f"{file}: is no UTF-8 text; export the model again") from None
-    for number, line in enumerate(content.splitlines(), start=1):
-        if not line.startswith("#"):
-            yield number, line
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({error.strerror}); check the file") from None
 
 
 def _malformed(file: Path, number: int) -> InputError:

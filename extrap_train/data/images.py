@@ -11,10 +11,10 @@ from jaxtyping import Float, Shaped, UInt8
 from PIL import Image
 from torch import Tensor
 
+from extrap_train.data.paths import require_file
 from extrap_train.data.picture_files import (
     MAX_PIXELS,
     read_turned,
-    require_file,
     same_view,
 )
 from extrap_train.errors import InputError

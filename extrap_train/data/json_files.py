@@ -9,20 +9,28 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
+from extrap_train.data.paths import require_file
 from extrap_train.data.validation import require_list
 from extrap_train.errors import InputError
 
-GZIP_FLOOR_BYTES = 64 * 2**20
-GZIP_RATIO = 100
+MAX_JSON_BYTES = 64 * 2**20
+"""Of a file that is parsed whole: parsed, JSON takes up to thirty times the room of its text."""
+MAX_ENTRY_BYTES = 64 * 2**10
+"""Of one entry of a list that is read entry by entry; CO3D's have two thousand."""
+GZIP_FLOOR_BYTES = 32 * 2**20
+GZIP_RATIO = 40
 """Annotations shrink to between a third and a tenth; a decompression bomb, to a thousandth."""
-_PIECE_BYTES = 2**20
+_PIECE_BYTES = 2**18
 _SPACE = " \t\r\n"
 _CUT_NUMBER = re.compile(r"[-+.eE0-9]*\Z")
 
 
 def read_json(path: Path) -> Any:
-    """The content of a JSON file; `.jgz` and `.gz` files are gzip-compressed."""
-    content = b"".join(_pieces(path))
+    """The content of a JSON file; `.jgz` and `.gz` files are gzip-compressed.
+
+    Raises InputError where it is none, no regular file, or larger than `MAX_JSON_BYTES`.
+    """
+    content = b"".join(_pieces(path, MAX_JSON_BYTES))
     try:
         return json.loads(content)
     except (ValueError, RecursionError) as error:
@@ -86,12 +94,17 @@ class _Text:
             except (ValueError, RecursionError) as error:
                 # Cut off by the piece's end, or wrong? Twice as much each time, so that a long
                 # value is not begun more often than its length has digits.
-                if isinstance(error, RecursionError) or not self._read_on(len(self._text)):
+                begun = len(self._text) - self._at
+                if begun > MAX_ENTRY_BYTES:
+                    raise _too_large(self.path, "has an entry of", MAX_ENTRY_BYTES) from None
+                if isinstance(error, RecursionError) or not self._read_on(begun):
                     _refuse(self.path, error)
                 continue
             # A number may go on in the next piece, and of `1.` or `1e-` only the 1 is a value.
             if _CUT_NUMBER.match(self._text, end) and self._read_on(1):
                 continue
+            if end - self._at > MAX_ENTRY_BYTES:
+                raise _too_large(self.path, "has an entry of", MAX_ENTRY_BYTES)
             self._at = end
             return value
 
@@ -117,29 +130,34 @@ def _decoded(path: Path) -> Iterator[str]:
         _refuse(path, error)
 
 
-def _pieces(path: Path) -> Iterator[bytes]:
-    """A file's bytes, gunzipped where its name says so."""
+def _pieces(path: Path, limit: int | None = None) -> Iterator[bytes]:
+    """A file's bytes, gunzipped where its name says so, and no more than `limit`."""
+    require_file(path)
     try:
         zipped = path.suffix in (".jgz", ".gz")
-        limit = GZIP_FLOOR_BYTES + GZIP_RATIO * path.stat().st_size
+        if zipped:
+            expanded = GZIP_FLOOR_BYTES + GZIP_RATIO * path.stat().st_size
+            limit = min(limit or expanded, expanded)
         length = 0
         with gzip.open(path) if zipped else path.open("rb") as file:
             while piece := file.read(_PIECE_BYTES):
                 length += len(piece)
-                if length > limit:
-                    raise InputError(
-                        f"{path}: expands to more than {limit >> 20} MiB, which no real annotation "
-                        "file does; download it again from a source you trust"
-                    )
+                if limit is not None and length > limit:
+                    raise _too_large(path, "holds", limit)
                 yield piece
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; is the download complete?") from None
     except gzip.BadGzipFile:
         raise InputError(f"{path}: is not a gzip file; download it again") from None
     except (EOFError, zlib.error):
         raise InputError(f"{path}: is a truncated or damaged gzip file; get it again") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error}); check the file") from None
+
+
+def _too_large(path: Path, what: str, limit: int) -> InputError:
+    return InputError(
+        f"{path}: {what} more than {limit >> 10:,} KiB of text, which no real file of its kind "
+        "does; get it again from a source you trust"
+    )
 
 
 def _refuse(path: Path, error: Exception) -> NoReturn:

@@ -1,15 +1,23 @@
-"""Paths that stand in files from outside: checked as text, and resolved below their folder."""
+"""Paths that stand in files from outside: their text is checked, the user's own links are followed.
+
+A data set on several disks, a hub's cache, git-annex and DVC are made of symbolic links, so a link
+may lead anywhere; a text in a file that somebody else wrote may not.
+"""
 
 import os
 import re
+import stat
 from pathlib import Path
 
 from extrap_train.errors import InputError
 
 MAX_NAME_BYTES = 255
 """Of a file or folder, on every common file system."""
+MAX_PATH_BYTES = 4095
 # Absolute, on a Windows drive, with a `..` among its parts, or with a NUL that would end it early.
 _LEAVES_FOLDER = re.compile(r"^[/\\]|^[A-Za-z]:|(^|[/\\])\.\.([/\\]|$)|\0")
+_UNPRINTABLE = re.compile("[\x01-\x1f\x7f-\x9f\ud800-\udfff]")
+"""Control characters and halves of surrogate pairs."""
 
 
 def check_relative(relative: str, file: Path) -> str:
@@ -19,39 +27,34 @@ def check_relative(relative: str, file: Path) -> str:
     """
     if not relative or _LEAVES_FOLDER.search(relative):
         raise InputError(
-            f"{file}: the path {relative!r} is absolute, empty or climbs out of its folder; "
+            f"{file}: the path {relative[:60]!a} is absolute, empty or climbs out of its folder; "
             "only paths below the data set's root can be read: correct the entry"
         )
-    try:
-        longest = max(map(len, os.fsencode(relative).split(b"/")))
-    except UnicodeEncodeError:
-        raise InputError(
-            f"{file}: the path {relative!a} is no Unicode; correct the entry"
-        ) from None
-    if longest > MAX_NAME_BYTES:
+    if _UNPRINTABLE.search(relative):
+        raise InputError(f"{file}: the path {relative[:60]!a} is no plain text; correct the entry")
+    encoded = os.fsencode(relative)
+    if len(encoded) > MAX_PATH_BYTES or max(map(len, encoded.split(b"/"))) > MAX_NAME_BYTES:
         raise InputError(f"{file}: the path {relative[:60]!r}… has too long a name; correct it")
     return relative
 
 
-def resolve_inside(root: Path, relative: str) -> Path:
-    """The real path of an existing file below `root`, symbolic links followed.
-
-    Raises InputError where it is missing or where a link leads out of `root`.
-    """
-    path = root / relative
+def require_file(path: Path) -> Path:
+    """`path`, if a regular file is there, links followed; a pipe or a device would never end."""
     try:
-        resolved = path.resolve()
-        exists = resolved.is_file()
-    except (OSError, RuntimeError, ValueError) as error:  # too long, or a loop of links
-        reason = str(error).split(":")[0]
-        raise InputError(f"{path}: no file can be there ({reason}); correct the entry") from None
-    if not resolved.is_relative_to(root.resolve()):
-        raise InputError(
-            f"{path}: leads out of {root} to {resolved}; copy the file into the data set instead"
-        )
-    if not exists:
-        raise InputError(f"{path}: no such file; restore it or remove its entry")
-    return resolved
+        mode = path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        if path.is_symlink():
+            raise InputError(
+                f"{path}: is a link to {path.readlink()}, where no file is; fetch that file (git "
+                "annex get, dvc pull) or remove its entry"
+            ) from None
+        raise InputError(f"{path}: no such file; restore it or remove its entry") from None
+    except (OSError, RuntimeError, ValueError) as error:  # too long, a loop of links, no permission
+        reason = error.strerror if isinstance(error, OSError) else "no valid path"
+        raise InputError(f"{path}: cannot be read ({reason}); correct the entry") from None
+    if not stat.S_ISREG(mode):
+        raise InputError(f"{path}: is no regular file; put the file itself there")
+    return path
 
 
 def file_stamp(path: Path) -> tuple[int, int] | None:

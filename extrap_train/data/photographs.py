@@ -1,8 +1,10 @@
 """Posed photographs in a folder, whatever lists them: paths, lenses and poses to a sequence."""
 
 import logging
+import posixpath
+from collections.abc import Callable
 from collections.abc import Sequence as List
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,16 +12,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from extrap_train.data.camera_check import PoseConvention, find_pose_fault
 from extrap_train.data.images import read_depth, read_photograph
-from extrap_train.data.paths import resolve_inside
+from extrap_train.data.listed_files import PICTURE_SUFFIXES, ListedFiles
+from extrap_train.data.paths import require_file
+from extrap_train.data.picture_files import image_size, same_view
 from extrap_train.data.sequences import Frame, PointCloud, Sequence
-from extrap_train.data.validation import degenerate_camera, require_sound
+from extrap_train.data.validation import require_sound
 from extrap_train.errors import InputError
 from extrap_train.geometry.lens import Lens, undistort
-from extrap_train.views import Camera, View, stack_cameras
+from extrap_train.views import Camera, View, stack_cameras, stack_poses
 
 CATEGORY = "scene"
 """What stands for a category where a capture has none."""
+MAX_FRAMES = 100_000
+"""Of a capture; more are no capture of one scene."""
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +47,17 @@ class Photograph:
 
 
 @dataclass(frozen=True)
+class Listed:
+    """An entry of a description."""
+
+    path: str
+    """Of its picture, as it stands there; it has passed `check_relative`."""
+    describe: Callable[[str], Photograph]
+    """The photograph, by the path at which the picture was found; InputError where the entry cannot
+    be used."""
+
+
+@dataclass(frozen=True)
 class _Loader:
     """Reads one photograph and undoes its lens; a dataclass, so that workers can be sent it."""
 
@@ -57,10 +75,12 @@ class _Loader:
 
     def load(self, *, depth: bool = True) -> View:
         photo, size = self.photograph, (self.camera.height, self.camera.width)
-        image_path = resolve_inside(self.root, photo.image_path)
-        mask_path = resolve_inside(self.root, photo.mask_path) if photo.mask_path else None
+        image_path = require_file(self.root / photo.image_path)
+        mask_path = require_file(self.root / photo.mask_path) if photo.mask_path else None
         image, mask = read_photograph(image_path, size, mask_path)
-        far = _read_depth(self.root, photo) if depth and photo.depth_path else None
+        far = None
+        if depth and photo.depth_path:
+            far = read_depth(require_file(self.root / photo.depth_path), size, photo.depth_scale)
         return View(
             image=self._straight(image.permute(1, 2, 0)).permute(2, 0, 1).contiguous(),
             camera=self.camera,
@@ -76,63 +96,94 @@ class _Loader:
         return torch.from_numpy(undistort(picture.numpy(), lens, self.pinhole, nearest))
 
 
-def present_pictures(root: Path, paths: List[str], description: Path) -> set[str]:
-    """Those of `paths` that exist below `root`; the missing are named in one warning.
-
-    `description` is the file that lists them. Raises InputError where none exists.
-    """
-    present = {path for path in paths if (root / path).is_file()}
-    missing = sorted(set(paths) - present)
-    if not present:
-        raise InputError(
-            f"{description}: none of the {len(paths)} pictures it lists is in {root}; "
-            "put the pictures there"
-        )
-    if missing:
-        log.warning(
-            "%s: %d of %d entries have no picture and are left out: %s",
-            description,
-            len(missing),
-            len(paths),
-            ", ".join(missing[:3]) + (", …" if len(missing) > 3 else ""),
-        )
-    return present
-
-
 def sequence_of_photographs(
-    root: Path,
+    files: ListedFiles,
     name: str,
-    photographs: List[Photograph],
+    listed: List[Listed],
     description: Path,
+    convention: PoseConvention,
     point_cloud: PointCloud | None = None,
 ) -> Sequence:
-    """A sequence of photographs in the order of their paths.
+    """A sequence of the photographs below `files.root`, in the order of their paths.
 
-    `description` is the file that lists them. Raises InputError where a picture is listed
-    twice, a camera is degenerate or a lens cannot be undone.
+    `description` is the file that lists them. Entries without a picture, and those that cannot be
+    used, are left out with one warning each kind. Raises InputError where a picture is listed
+    twice, none is left, or the cameras can see nothing in common.
     """
-    ordered = sorted(photographs, key=lambda photo: photo.image_path)
-    paths = [photo.image_path for photo in ordered]
-    if len(set(paths)) != len(paths):
-        raise InputError(f"{description}: lists a picture twice; remove the second entry")
-    frames = []
-    for photo, frame_name in zip(ordered, _frame_names(paths), strict=True):
-        pinhole, camera = pinhole_camera(photo, description)
-        loader = _Loader(root, photo, pinhole, camera, frame_name)
-        frames.append(
-            Frame(
-                name=frame_name,
-                camera=camera,
-                has_depth=photo.depth_path is not None,
-                has_mask=photo.mask_path is not None,
-                load=loader.load,
-                files=loader.files,
-            )
+    if len(listed) > MAX_FRAMES:
+        raise InputError(f"{description}: lists more than {MAX_FRAMES:,} pictures; split it")
+    entries = _find_pictures(files, listed, description)
+    names = _frame_names([_name_path(path, entry) for path, entry in entries])
+    frames, left_out, resized = [], [], []
+    for (path, entry), frame_name in zip(entries, names, strict=True):
+        if entry is None:
+            continue
+        try:
+            annotated = entry.describe(path)
+            photo = _at_its_size(files.root, annotated)
+            frames.append(_frame(files.root, photo, frame_name, description))
+        except InputError as error:
+            left_out.append(str(error))
+            continue
+        if photo is not annotated:
+            resized.append(f"{path} has {photo.height} x {photo.width} pixels (height x width)")
+    if not frames:
+        raise InputError(left_out[0])
+    if left_out:
+        log.warning("%d of %d frames are left out: %s", len(left_out), len(listed), left_out[0])
+    if resized:
+        say = "%s: %d pictures have another size than it says: their lenses are scaled (%s)"
+        log.warning(say, description, len(resized), resized[0])
+    if fault := find_pose_fault(stack_poses([frame.camera for frame in frames]), convention):
+        raise InputError(f"{description}: {fault}")
+    return Sequence(
+        CATEGORY,
+        name,
+        tuple(frames),
+        left_out=tuple(left_out),
+        listed=tuple(names),
+        point_cloud=point_cloud,
+    )
+
+
+def _find_pictures(
+    files: ListedFiles, listed: List[Listed], description: Path
+) -> list[tuple[str, Listed | None]]:
+    """The entries by the paths of their pictures, in order; None for one whose picture is missing.
+
+    Warns of these; InputError where there is no picture at all, or one is listed twice.
+    """
+    entries: list[tuple[str, Listed | None]] = []
+    missing, seen = [], set()
+    for entry in listed:
+        path = files.find(entry.path, PICTURE_SUFFIXES)
+        if path is None:
+            missing.append(entry.path)
+            entries.append((entry.path, None))
+        elif path in seen:
+            raise InputError(f"{description}: lists {path} twice; remove the second entry")
+        else:
+            seen.add(path)
+            entries.append((path, entry))
+    if missing:
+        count = "none" if not seen else f"only {len(seen)}"
+        fault = (
+            f"{description}: {count} of the {len(listed)} pictures it lists is in {files.root} "
+            f"({files.explain(missing[0])})"
         )
-    return Sequence(CATEGORY, name, tuple(frames), point_cloud=point_cloud)
+        if not seen:
+            raise InputError(f"{fault}; put the pictures there")
+        log.warning("%s", fault)
+    return sorted(entries, key=lambda entry: entry[0])
 
 
-def _frame_names(paths: list[str]) -> list[str]:
+def _name_path(path: str, entry: Listed | None) -> str:
+    """The path that a frame is named by: its file's, but for case, which the description's has."""
+    listed = posixpath.normpath(entry.path.replace("\\", "/")) if entry else path
+    return listed if listed.casefold() == path.casefold() else path
+
+
+def _frame_names(paths: List[str]) -> list[str]:
     """File names where these are unique, else whole paths with the folders joined by `_`."""
     names = [Path(path).name for path in paths]
     if len(set(names)) == len(names):
@@ -140,28 +191,53 @@ def _frame_names(paths: list[str]) -> list[str]:
     return ["_".join(Path(path).parts) for path in paths]
 
 
+def _at_its_size(root: Path, photo: Photograph) -> Photograph:
+    """The photograph at its picture's size, where that is another size of the same view."""
+    size = photo.height, photo.width
+    try:
+        height, width = image_size(root / photo.image_path, size)
+    except InputError:  # said where the frame is read
+        return photo
+    if (height, width) == size or not same_view((height, width), size):
+        return photo
+    lens = photo.lens.resized(width / photo.width, height / photo.height)
+    return replace(photo, height=height, width=width, lens=lens)
+
+
+def _frame(root: Path, photo: Photograph, name: str, description: Path) -> Frame:
+    pinhole, camera = pinhole_camera(photo, description)
+    loader = _Loader(root, photo, pinhole, camera, name)
+    return Frame(
+        name=name,
+        camera=camera,
+        has_depth=photo.depth_path is not None,
+        has_mask=photo.mask_path is not None,
+        load=loader.load,
+        files=loader.files,
+    )
+
+
 def pinhole_camera(photo: Photograph, description: Path) -> tuple[Lens, Camera]:
     """The camera of a photograph once its lens is undone; InputError where it is degenerate."""
-    if not all(np.isfinite([*photo.lens.matrix.flat, *photo.lens.distortion])):
+    lens = photo.lens
+    if not all(np.isfinite([*lens.matrix.flat, *lens.distortion, lens.radial_r8])):
         raise InputError(f"{description}: the lens of {photo.image_path} is not finite; correct it")
-    if not (photo.lens.fx > 0 and photo.lens.fy > 0):  # or its distortion would be blamed
-        raise InputError(degenerate_camera(photo.image_path, description))
+    straight = _camera(photo, replace(lens, distortion=(), fisheye=False, radial_r8=0.0))
+    # First, or the distortion would be blamed for a focal length of 0.
+    require_sound(stack_cameras([straight]), [photo.image_path], description)
     try:
-        pinhole = photo.lens.pinhole(photo.height, photo.width)
+        pinhole = lens.pinhole(photo.height, photo.width)
     except ValueError as error:
         raise InputError(
             f"{description}: {photo.image_path}: {error}; correct the lens or undistort beforehand"
         ) from None
-    camera = Camera(
+    return pinhole, _camera(photo, pinhole)
+
+
+def _camera(photo: Photograph, pinhole: Lens) -> Camera:
+    return Camera(
         photo.world_to_cam.float(),
         torch.from_numpy(pinhole.matrix).float(),
         photo.height,
         photo.width,
     )
-    require_sound(stack_cameras([camera]), [photo.image_path], description)
-    return pinhole, camera
-
-
-def _read_depth(root: Path, photo: Photograph) -> Float[Tensor, "h w"]:
-    path = resolve_inside(root, photo.depth_path or "")
-    return read_depth(path, (photo.height, photo.width), photo.depth_scale)

@@ -4,7 +4,6 @@ the way their cameras hold them.
 
 import functools
 import logging
-import stat
 import struct
 import warnings
 from collections.abc import Callable
@@ -12,6 +11,7 @@ from pathlib import Path
 
 from PIL import Image, ImageOps
 
+from extrap_train.data.paths import require_file
 from extrap_train.errors import InputError
 
 FORMATS = ("BMP", "GIF", "JPEG", "PNG", "PPM", "TIFF", "WEBP")
@@ -41,16 +41,6 @@ _MOST_ROUNDING = 0.05
 _HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 
 log = logging.getLogger(__name__)
-
-
-def require_file(path: Path) -> None:
-    """InputError unless `path` is a regular file: a pipe or a device never ends."""
-    try:
-        regular = stat.S_ISREG(path.stat().st_mode)
-    except (OSError, ValueError):
-        raise InputError(f"{path}: no such file; restore it or remove its entry") from None
-    if not regular:
-        raise InputError(f"{path}: is no regular file; put the file itself there")
 
 
 def open_picture(path: Path) -> Image.Image:

@@ -3,12 +3,14 @@
 from pathlib import Path
 
 from extrap_train.config import SyntheticConfig
+from extrap_train.data.camera_check import CO3D_POSES, find_pose_fault
 from extrap_train.data.co3d import read_sequence
 from extrap_train.data.colmap_model import find_model, read_model
 from extrap_train.data.posed import TRANSFORMS, read_transforms
 from extrap_train.data.sequences import Sequence
 from extrap_train.data.synthetic.capture import synthetic_sequence
 from extrap_train.errors import InputError
+from extrap_train.views import stack_poses
 
 CO3D_SCHEME = "co3d:"
 SYNTHETIC_SCHEME = "synthetic:"
@@ -51,7 +53,11 @@ def _open_co3d(spec: str) -> Sequence:
     path = Path(spec.removeprefix(CO3D_SCHEME)).expanduser()
     if len(path.parts) < 3:
         raise InputError(f"scene {spec!r}: is not co3d:ROOT/category/sequence; give all three")
-    return read_sequence(path.parent.parent, path.parent.name, path.name)
+    sequence = read_sequence(path.parent.parent, path.parent.name, path.name)
+    cameras = stack_poses([frame.camera for frame in sequence.frames])
+    if fault := find_pose_fault(cameras, CO3D_POSES):
+        raise InputError(f"scene {spec!r}: {fault}")
+    return sequence
 
 
 def _open_synthetic(spec: str, options: SyntheticConfig) -> Sequence:
@@ -67,4 +73,6 @@ def _images_folder(folder: Path, model: Path) -> Path:
     for candidate in candidates:
         if (candidate / "images").is_dir():
             return candidate / "images"
-    raise InputError(f"{model}: has no folder `images` beside it; put the pictures there")
+    alike = sorted(path.name for path in folder.glob("[Ii]m*") if path.is_dir())
+    there = f" (there is {', '.join(alike[:4])})" if alike else ""
+    raise InputError(f"{model}: has no folder `images` beside it{there}; put the pictures there")

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from extrap_train.data.paths import resolve_inside
+from extrap_train.data.paths import require_file
 from extrap_train.views import Camera, View
 
 
@@ -40,14 +40,13 @@ class PointCloud:
     """A file of points as a description lists it, which need not be there."""
 
     root: Path
-    """Of the data set: no link may lead out of it."""
     path: str
+    """Below the root; it has passed `check_relative`."""
 
     def find(self) -> Path | None:
-        """The real file, None where there is none; InputError where a link leads out of `root`."""
-        if not (self.root / self.path).is_file():
-            return None
-        return resolve_inside(self.root, self.path)
+        """The file, None where there is none."""
+        file = self.root / self.path
+        return require_file(file) if file.exists() else None
 
 
 @dataclass(frozen=True)
@@ -60,6 +59,9 @@ class Sequence:
     """In the order in which they were taken."""
     left_out: tuple[str, ...] = ()
     """Why others, which the capture lists, are none of them: a reason for each."""
+    listed: tuple[str, ...] = ()
+    """Names of all that the capture's description lists, those without a picture and those that are
+    left out included, in order; empty where a capture has no such list."""
     viewpoint_quality: float | None = None
     """CO3D's score of its camera poses; None where the capture has none."""
     point_cloud_quality: float | None = None

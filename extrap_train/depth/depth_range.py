@@ -12,6 +12,8 @@ NEAREST, FARTHEST = 0.3, 20.0
 """Range of depths, as multiples of the scene centre's depth."""
 WIDEST_DISPARITY = 0.25
 """Of cameras that look the same way: largest displacement, as a share of the longer side."""
+LEAST_BASELINE = 1e-6
+"""In scene units: cameras that are nearer to each other stand in one place."""
 LEAST_SEEN = 0.1
 """A depth is not tried if a smaller share of the pixels is then seen by any neighbour."""
 LEAST_CONVERGENCE_RAD = 0.05
@@ -44,7 +46,8 @@ def inverse_depth_range(
     else:
         baseline = max(float((other.center - camera.center).norm()) for other in neighbours)
         longer = max(camera.height, camera.width)
-        greatest = WIDEST_DISPARITY * longer / (float(camera.intrinsics[0, 0]) * baseline)
+        pixels_at_one = float(camera.intrinsics[0, 0]) * max(baseline, LEAST_BASELINE)
+        greatest = WIDEST_DISPARITY * longer / pixels_at_one
         least = greatest / 100
     return _seen(camera, neighbours, torch.linspace(least, greatest, 200))
 

@@ -77,9 +77,12 @@ def _distances(positions: Float[Tensor, "n 3"]) -> Float[Tensor, "n n"]:
 
 
 def _angles_rad(offsets: Float[Tensor, "n 3"]) -> Float[Tensor, "n n"]:
-    """Between every two of them; infinite on the diagonal."""
-    directions = offsets / offsets.norm(dim=-1, keepdim=True)
-    return torch.acos((directions @ directions.mT).clamp(-1, 1)).fill_diagonal_(torch.inf)
+    """Between every two of them; infinite on the diagonal, and from a zero one, which has none."""
+    distance = offsets.norm(dim=-1, keepdim=True)
+    directions = offsets / distance.clamp_min(torch.finfo(offsets.dtype).tiny)
+    angle_rad = torch.acos((directions @ directions.mT).clamp(-1, 1)).fill_diagonal_(torch.inf)
+    apart = (distance > 0) & (distance > 0).mT
+    return torch.where(apart, angle_rad, torch.inf)
 
 
 def _badness(angle_rad: Float[Tensor, "n n"], limit_rad: float) -> Float[Tensor, "n n"]:

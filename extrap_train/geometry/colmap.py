@@ -39,13 +39,28 @@ CAMERA_MODELS = (
     ),
     CameraModel(8, "SIMPLE_RADIAL_FISHEYE", ("f", "cx", "cy", "k1"), True),
     CameraModel(9, "RADIAL_FISHEYE", ("f", "cx", "cy", "k1", "k2"), True),
+    CameraModel(14, "SIMPLE_FISHEYE", ("f", "cx", "cy"), True),
+    CameraModel(15, "FISHEYE", ("fx", "fy", "cx", "cy"), True),
 )
+
+OTHER_MODELS = {
+    7: ("FOV", 5),
+    10: ("THIN_PRISM_FISHEYE", 12),
+    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    12: ("SIMPLE_DIVISION", 4),
+    13: ("DIVISION", 5),
+    16: ("EUCM", 6),
+    17: ("EQUIRECTANGULAR", 2),
+}
+"""COLMAP's other models by number: name and how many parameters. None of these can be undone."""
 
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE_COEFFICIENTS = ("k1", "k2", "k3", "k4")
 
 
-def lens_from_parameters(values: dict[str, float], fisheye: bool = False) -> Lens:
+def lens_from_parameters(
+    values: dict[str, float], fisheye: bool = False, radial_r8: float = 0.0
+) -> Lens:
     """A lens from named parameters; `f` alone stands for both focal lengths, others default to 0.
 
     Raises KeyError where a focal length or the principal point is missing.
@@ -59,6 +74,7 @@ def lens_from_parameters(values: dict[str, float], fisheye: bool = False) -> Len
         cy=values["cy"],
         distortion=tuple(values.get(name, 0.0) for name in names),
         fisheye=fisheye,
+        radial_r8=radial_r8,
     )
 
 

@@ -1,0 +1,133 @@
+"""Whether a capture's cameras can see something in common, and the likely cause where they cannot.
+
+One check for every task: captures pass it when they are opened. Poses in another convention look
+sound one by one; together they stand in one place, or look away from each other.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from extrap_train.geometry.opengl import (
+    flip_up_and_forward,
+    opengl_from_world_to_cam,
+    rigid_inverse,
+)
+from extrap_train.geometry.viewpoints import camera_centers, directions_from, scene_center
+from extrap_train.views import Camera
+
+LOOKS_AT_RAD = np.deg2rad(60)
+"""Between an optical axis and a point that the camera can be said to look at."""
+PARALLEL_RAD = np.deg2rad(15)
+"""Cameras whose axes differ by less from their mean look the same way, and need no common point."""
+WIDE_RAD = np.deg2rad(20)
+"""Axes that differ by more prove that cameras stand around what they look at."""
+LEAST_APART = 1e-4
+"""Of the cameras' distance from the origin: below it single precision blurs their places."""
+ONE_PLACE = 1e-6
+"""In scene units."""
+LEAST_SHARE, NEARLY_ALL = 1 / 3, 0.9
+"""Of cameras that look at one point: too few below it, and enough to name a convention."""
+CLEARLY_RAD = np.deg2rad(5)
+"""By so much, and twofold, must another convention bring the axes nearer to one point."""
+
+Reread = Callable[[Float[Tensor, "n 4 4"]], Float[Tensor, "n 4 4"]]
+
+
+@dataclass(frozen=True)
+class PoseConvention:
+    """What the poses of a file are, and what else people put there."""
+
+    name: str
+    mistakes: Mapping[str, Reread] = field(default_factory=dict)
+    """What they may be instead, each with what makes the `world_to_cam` that was read right."""
+
+
+OPENGL_POSES = PoseConvention(
+    "camera-to-world in OpenGL's axes (+X right, +Y up, −Z forward)",
+    {
+        "camera-to-world in OpenCV's axes (+Y down, +Z forward)": lambda read: rigid_inverse(
+            opengl_from_world_to_cam(read)
+        ),
+        "world-to-camera in OpenCV's axes, as COLMAP has them": opengl_from_world_to_cam,
+        "world-to-camera in OpenGL's axes": lambda read: rigid_inverse(
+            flip_up_and_forward(rigid_inverse(opengl_from_world_to_cam(read)))
+        ),
+    },
+)
+COLMAP_POSES = PoseConvention(
+    "world-to-camera, as COLMAP writes them", {"camera-to-world": rigid_inverse}
+)
+CO3D_POSES = PoseConvention("PyTorch3D's, as CO3D has them")
+
+
+def find_pose_fault(cameras: Camera, convention: PoseConvention) -> str:
+    """What is wrong with the cameras of one capture, and the likely cause; empty where nothing is.
+
+    Only the poses matter. A lone camera is never at fault, nor are cameras in several places that
+    look the same way, unless their poses read as another convention show one point from many sides.
+    """
+    if len(cameras.world_to_cam) < 2:
+        return ""
+    mistake = _likely_mistake(cameras, convention)
+    belong = f"its poses must be {convention.name}"
+    if mistake:
+        belong += f", and look as if they were {mistake}"
+    apart, away = _extent(cameras)
+    if not _stand_apart(cameras):
+        return (
+            f"its cameras stand in one place, as far as single precision can tell ({apart:.1e} "
+            f"apart, {away:.1e} from the origin); {belong}; coordinates of a map need a common "
+            "offset taken off"
+        )
+    share = float((_angles_to_center_rad(cameras) < LOOKS_AT_RAD).mean())
+    if mistake or (share < LEAST_SHARE and not _look_the_same_way(cameras, PARALLEL_RAD)):
+        return (
+            f"its cameras look at nothing in common ({share:.0%} of them look at where their axes "
+            f"meet); {belong}"
+        )
+    return ""
+
+
+def _likely_mistake(cameras: Camera, convention: PoseConvention) -> str:
+    """What the poses must be if they are to show one point from many sides; empty if they do."""
+    angle_rad = _angles_to_center_rad(cameras).mean()
+    for name, reread in convention.mistakes.items():
+        other = replace(cameras, world_to_cam=reread(cameras.world_to_cam))
+        angles_rad = _angles_to_center_rad(other)
+        if (
+            (angles_rad < LOOKS_AT_RAD).mean() >= NEARLY_ALL
+            and not _look_the_same_way(other, WIDE_RAD)
+            and _stand_apart(other)
+            and angle_rad > 2 * angles_rad.mean() + CLEARLY_RAD
+        ):
+            return name
+    return ""
+
+
+def _extent(cameras: Camera) -> tuple[float, float]:
+    """How far the cameras stand from their middle, and from the origin, at most."""
+    centers = camera_centers(cameras)
+    apart = np.linalg.norm(centers - centers.mean(0), axis=1).max()
+    return float(apart), float(np.linalg.norm(centers, axis=1).max())
+
+
+def _stand_apart(cameras: Camera) -> bool:
+    apart, away = _extent(cameras)
+    return apart > max(LEAST_APART * away, ONE_PLACE)
+
+
+def _angles_to_center_rad(cameras: Camera) -> Float[np.ndarray, " n"]:
+    """Between each optical axis and the direction to the point where the axes meet."""
+    towards = -directions_from(cameras, scene_center(cameras))
+    forward = cameras.forward.double().numpy(force=True)
+    return np.arccos(np.clip((forward * towards).sum(1), -1.0, 1.0))
+
+
+def _look_the_same_way(cameras: Camera, within_rad: float) -> bool:
+    axes = cameras.forward.double().numpy(force=True)
+    mean = axes.mean(0)
+    return bool((axes @ mean > np.cos(within_rad) * np.linalg.norm(mean)).all())

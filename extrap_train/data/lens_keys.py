@@ -1,0 +1,157 @@
+"""Every key of a `transforms.json` that says something of the lens: understood, or refused by name.
+
+nerfstudio, instant-ngp and Blender each have spellings of their own (docs/captures.md lists them).
+Keys that are neither in the tables below nor asked for here do not change what a pixel shows, and
+are passed over.
+"""
+
+import math
+from typing import Any
+
+from extrap_train.geometry.colmap import CAMERA_MODELS, lens_from_parameters
+from extrap_train.geometry.lens import Lens
+
+PERSPECTIVE = "PERSPECTIVE"
+MODELS = {model.name: model.fisheye for model in CAMERA_MODELS} | {PERSPECTIVE: False}
+"""Values of `camera_model`, and whether they are fisheyes."""
+RATIONAL = "FULL_OPENCV"
+"""The model in which k4, k5 and k6 stand in OpenCV's denominator."""
+
+REFUSED = {
+    "skew": "rows and columns that are not at right angles",
+    "rolling_shutter": "a camera that moves while it takes a picture",
+    "equirectangular": "an equirectangular projection",
+    "latlong": "an equirectangular projection",
+    "orthographic": "an orthographic projection",
+    "from_mitsuba": "matrices in Mitsuba's axes",
+    **dict.fromkeys(
+        ("p3", "p4", "s1", "s2", "s3", "s4", "sx1", "sy1", "xi"), "a lens model of its own"
+    ),
+    **dict.fromkeys((f"ftheta_p{i}" for i in range(6)), "an f-theta lens"),
+    **dict.fromkeys(("b1", "b2"), "Metashape's affinity and skew"),
+    **dict.fromkeys(("distortion", "distortion_coefficients"), "distortion in an unknown order"),
+}
+"""What such a key means. Where it says nothing (0, false, a list of zeros) it is passed over."""
+
+_COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+_PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")
+"""nerfstudio's order in `distortion_params`."""
+_SPELLINGS = (
+    (("fl_x",), ("x_fov",), ("camera_angle_x",)),
+    (("fl_y",), ("y_fov",), ("camera_angle_y",)),
+    (_COEFFICIENTS, ("distortion_params",)),
+    (("camera_model",), ("is_fisheye",)),
+    (("depth_file_path",), ("depth_path",)),
+)
+LENS_KEYS = frozenset(REFUSED) | {key for group in _SPELLINGS[:4] for keys in group for key in keys}
+LENS_KEYS |= {"cx", "cy"}
+"""Every key that is looked at here."""
+
+
+def merged_entry(common: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
+    """A frame's keys upon those of all frames; its own spelling of a thing replaces another's."""
+    hidden: set[str] = set()
+    for spellings in _SPELLINGS:
+        said = [keys for keys in spellings if any(key in frame for key in keys)]
+        if said:
+            hidden.update(key for keys in spellings if keys not in said for key in keys)
+    return {key: value for key, value in common.items() if key not in hidden} | frame
+
+
+def lens_of(entry: dict[str, Any], height: int, width: int) -> Lens:
+    """The lens of a merged entry, for a picture of `height` × `width` pixels.
+
+    Raises KeyError for the focal length where there is none, and ValueError or TypeError that names
+    the key where a value cannot be used.
+    """
+    for key, value in entry.items():
+        if key in REFUSED and _says_something(value):
+            raise ValueError(
+                f"{key} means {REFUSED[key]}, which cannot be undone: convert the capture"
+            )
+    focal = _focal(entry, "x", width), _focal(entry, "y", height)
+    known = [length for length in focal if length is not None]
+    if not known:
+        raise KeyError("fl_x")
+    center = _number(entry, "cx", width / 2), _number(entry, "cy", height / 2)
+    return _distorted(entry, {"fx": known[0], "fy": known[-1], "cx": center[0], "cy": center[1]})
+
+
+def _distorted(entry: dict[str, Any], pinhole: dict[str, float]) -> Lens:
+    model, coefficients = entry.get("camera_model", PERSPECTIVE), _coefficients(entry)
+    if _is_fisheye(entry, model):
+        _require_zero(coefficients, ("p1", "p2", "k5", "k6"), "a fisheye lens")
+        return lens_from_parameters(pinhole | coefficients, fisheye=True)
+    if model == RATIONAL:
+        return lens_from_parameters(pinhole | coefficients)
+    _require_zero(coefficients, ("k5", "k6"), f"a camera_model other than {RATIONAL}")
+    # The fourth radial term here, in OpenCV's model a coefficient of the denominator.
+    radial_r8 = coefficients.pop("k4", 0.0)
+    return lens_from_parameters(pinhole | coefficients, radial_r8=radial_r8)
+
+
+def _focal(entry: dict[str, Any], axis: str, side: int) -> float | None:
+    """In pixels; None where nothing is said of this axis."""
+    if f"fl_{axis}" in entry:
+        return _number(entry, f"fl_{axis}")
+    for key, unit in ((f"{axis}_fov", math.pi / 180), (f"camera_angle_{axis}", 1.0)):
+        if key in entry:
+            angle_rad = _number(entry, key) * unit
+            if not 0 < angle_rad < math.pi:
+                raise ValueError(
+                    f"{key} is {entry[key]!r}, no field of view (camera_angle_x and _y are in "
+                    "radians, x_fov and y_fov in degrees)"
+                )
+            return side / 2 / math.tan(angle_rad / 2)
+    return None
+
+
+def _coefficients(entry: dict[str, Any]) -> dict[str, float]:
+    found = {key: _number(entry, key) for key in _COEFFICIENTS if key in entry}
+    listed = entry.get("distortion_params")
+    if not _says_something(listed):
+        return found
+    if not isinstance(listed, list) or len(listed) not in (4, len(_PARAMS)):
+        raise ValueError(f"distortion_params {listed!r:.60} are not {', '.join(_PARAMS)}")
+    from_list = {
+        key: _number({"distortion_params": value}, "distortion_params")
+        for key, value in zip(_PARAMS, listed, strict=False)
+    }
+    if found and any(found.get(key, 0.0) != value for key, value in from_list.items()):
+        raise ValueError("distortion_params and k1, k2 … say different things: remove one of them")
+    return found | from_list
+
+
+def _is_fisheye(entry: dict[str, Any], model: Any) -> bool:
+    if model not in MODELS:
+        raise ValueError(f"camera_model {model!r:.60} is none of {', '.join(MODELS)}")
+    said = entry.get("is_fisheye", MODELS[model])
+    if said not in (True, False):
+        raise ValueError(f"is_fisheye is {said!r:.60}, neither true nor false")
+    if "camera_model" in entry and bool(said) != MODELS[model]:
+        raise ValueError(
+            f"is_fisheye {said} and camera_model {model} contradict each other: remove one of them"
+        )
+    return bool(said)
+
+
+def _require_zero(coefficients: dict[str, float], keys: tuple[str, ...], whose: str) -> None:
+    for key in keys:
+        if coefficients.get(key):
+            raise ValueError(f"{key} is no coefficient of {whose}, but {coefficients[key]}")
+
+
+def _says_something(value: Any) -> bool:
+    if isinstance(value, list):
+        return any(_says_something(part) for part in value)
+    return bool(value)
+
+
+def _number(entry: dict[str, Any], key: str, default: float | None = None) -> float:
+    value: Any = entry.get(key, default)
+    try:
+        if isinstance(value, bool):
+            raise TypeError
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{key} is {value!r:.60}, no number") from None
