@@ -95,6 +95,7 @@ def find_pose_fault(cameras: Camera, convention: PoseConvention) -> str:
 def _likely_mistake(cameras: Camera, convention: PoseConvention) -> str:
     """What the poses must be if they are to show one point from many sides; empty if they do."""
     angle_rad = _angles_to_center_rad(cameras).mean()
+    fits: dict[str, float] = {}
     for name, reread in convention.mistakes.items():
         other = replace(cameras, world_to_cam=reread(cameras.world_to_cam))
         angles_rad = _angles_to_center_rad(other)
@@ -104,8 +105,8 @@ def _likely_mistake(cameras: Camera, convention: PoseConvention) -> str:
             and _stand_apart(other)
             and angle_rad > 2 * angles_rad.mean() + CLEARLY_RAD
         ):
-            return name
-    return ""
+            fits[name] = float(angles_rad.mean())
+    return min(fits, key=lambda name: fits[name], default="")
 
 
 def _extent(cameras: Camera) -> tuple[float, float]:

@@ -23,11 +23,8 @@ from extrap_train.data.images import (
 from extrap_train.data.paths import file_stamp, require_file
 from extrap_train.data.sequences import Frame
 from extrap_train.data.validation import degenerate_camera
-from extrap_train.errors import InputError
 from extrap_train.views import Camera, View
 
-MAX_DEPTH_SCALE = 1e6
-"""Of CO3D's depth maps, whose units differ from its cameras'; a larger one is damage."""
 _JPEG_HEADER_BYTES, _BLACK_PIXELS_PER_BYTE = 1024, 32
 
 
@@ -203,8 +200,6 @@ def _encoded(paths: Iterable[str | None]) -> Shaped[np.ndarray, " n"]:
 
 def _read_depth(root: Path, files: DepthFiles, size: tuple[int, int]) -> Float[Tensor, "h w"]:
     path = require_file(root / files.path)
-    if files.scale > MAX_DEPTH_SCALE:
-        raise InputError(f"{path}: the scale of its depth is {files.scale}; correct its entry")
     depth = known_depth(read_sixteen_bit(path, size).view(np.float16), files.scale, path)
     if files.mask_path:
         depth *= read_depth_mask(require_file(root / files.mask_path), size)

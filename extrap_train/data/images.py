@@ -1,6 +1,5 @@
 """Photographs, masks and depth maps on disk to tensors, each checked against its annotated size."""
 
-import math
 import operator
 import tokenize
 from pathlib import Path
@@ -26,6 +25,8 @@ ARRAY_ERRORS = (
     *(RecursionError, MemoryError, tokenize.TokenError),
 )
 """What NumPy raises on damaged NPY files."""
+MAX_DEPTH_SCALE = 1e6
+"""Scene units per unit of a depth file; a larger one is damage."""
 
 _EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr")
 _SIXTEEN_BIT_MODES = ("I;16", "I;16B")
@@ -110,11 +111,11 @@ def read_depth(path: Path, size: tuple[int, int], scale: float) -> Float[Tensor,
 def known_depth(raw: Shaped[np.ndarray, "h w"], scale: float, path: Path) -> Float[Tensor, "h w"]:
     """`raw` × `scale`, 0 where that is not positive and finite.
 
-    An empty map, and a scale that is no positive number, is an error that names `path`.
+    An empty map, and a scale that cannot be, is an error that names `path`.
     """
-    if not (math.isfinite(scale) and scale > 0):
+    if not 0 < scale < MAX_DEPTH_SCALE:
         raise InputError(
-            f"{path}: the scale of its depth is {scale}, no positive number; correct its entry or "
+            f"{path}: the scale of its depth is {scale}, no possible one; correct its entry or "
             "estimate depth (depth=stereo)"
         )
     with np.errstate(invalid="ignore", over="ignore"):

@@ -123,7 +123,7 @@ def _coefficients(entry: dict[str, Any]) -> dict[str, float]:
 
 
 def _is_fisheye(entry: dict[str, Any], model: Any) -> bool:
-    if model not in MODELS:
+    if not isinstance(model, str) or model not in MODELS:
         raise ValueError(f"camera_model {model!r:.60} is none of {', '.join(MODELS)}")
     said = entry.get("is_fisheye", MODELS[model])
     if said not in (True, False):

@@ -159,7 +159,7 @@ def _find_pictures(
         path = files.find(entry.path, PICTURE_SUFFIXES)
         if path is None:
             missing.append(entry.path)
-            entries.append((entry.path, None))
+            entries.append((_normal(entry.path), None))
         elif path in seen:
             raise InputError(f"{description}: lists {path} twice; remove the second entry")
         else:
@@ -179,8 +179,12 @@ def _find_pictures(
 
 def _name_path(path: str, entry: Listed | None) -> str:
     """The path that a frame is named by: its file's, but for case, which the description's has."""
-    listed = posixpath.normpath(entry.path.replace("\\", "/")) if entry else path
+    listed = _normal(entry.path) if entry else path
     return listed if listed.casefold() == path.casefold() else path
+
+
+def _normal(listed: str) -> str:
+    return posixpath.normpath(listed.replace("\\", "/"))
 
 
 def _frame_names(paths: List[str]) -> list[str]:

@@ -34,8 +34,6 @@ KEYS = LENS_KEYS | {
     *("depth_file_path", "depth_unit_scale_factor", "depth_path", "integer_depth_scale"),
 }
 """Of what stands for all frames, what is looked at."""
-DEPTH_UNITS = (1e-9, 1e9)
-"""Scene units per unit of a depth file, beyond which it is none."""
 LAST_ROW_TOLERANCE = 1e-6
 """Of a matrix's last row, relative to its last number."""
 
@@ -151,8 +149,6 @@ def _depth(files: ListedFiles, entry: dict[str, Any]) -> tuple[str | None, float
         unit = float(entry["integer_depth_scale"])
     else:
         return None, 1.0
-    if not DEPTH_UNITS[0] < unit < DEPTH_UNITS[1]:
-        raise ValueError(f"the unit of its depth is {unit}")
     return _existing(files, path), unit
 
 

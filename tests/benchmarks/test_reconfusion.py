@@ -52,28 +52,39 @@ def _captures(root: Path) -> CapturesConfig:
     return CapturesConfig(source="reconfusion", root=str(root))
 
 
-@pytest.mark.parametrize("leads", ["out", "nowhere"])
-def test_a_cloud_is_not_read_through_a_link_that_leads_out(root: Path, leads: str) -> None:
-    file = root / "34_1479_4753" / "transforms.json"
-    content = json.loads(file.read_text())
-    file.write_text(json.dumps({**content, "ply_file_path": "cloud.ply"}))
-    outside = root.parent / "outside.ply"
-    file.with_name("cloud.ply").symlink_to(outside)
-    if leads == "nowhere":
-        (capture,) = open_captures(_captures(root), [])
-        assert capture.surface is None
-        return
-    outside.write_text("ply")
-    with pytest.raises(InputError, match=r"cloud\.ply: leads out of"):
-        open_captures(_captures(root), [])
-
-
 def test_ids_count_the_frames_in_name_order(root: Path) -> None:
     config = _captures(root)
     (draw,) = freeze(config, _RULES, open_captures(config, [])).draws
     assert (draw.sequence, draw.n_views, draw.draw) == ("34_1479_4753", 3, "given")
     assert [Path(name).stem[-1] for name in draw.inputs] == ["0", "2", "5"]
     assert [Path(name).stem[-1] for name in draw.targets] == ["1", "7"]
+
+
+@pytest.mark.parametrize("gone", [3, 4, 6])
+def test_ids_mean_the_same_where_a_picture_is_missing(root: Path, gone: int) -> None:
+    (root / "34_1479_4753" / "images" / f"frame{gone:06d}.png").unlink()
+    config = _captures(root)
+    (draw,) = freeze(config, _RULES, open_captures(config, [])).draws
+    assert [Path(name).stem[-1] for name in (*draw.inputs, *draw.targets)] == list("02517")
+
+
+def test_ids_mean_the_same_where_a_pose_is_unusable(root: Path) -> None:
+    file = root / "34_1479_4753" / "transforms.json"
+    content = json.loads(file.read_text())
+    for frame in content["frames"]:
+        if "000003" in frame["file_path"]:
+            frame["transform_matrix"][0][0] = float("nan")
+    file.write_text(json.dumps(content))
+    config = _captures(root)
+    (draw,) = freeze(config, _RULES, open_captures(config, [])).draws
+    assert [Path(name).stem[-1] for name in draw.inputs] == list("025")
+
+
+def test_a_split_that_asks_for_a_missing_picture_names_it(root: Path) -> None:
+    (root / "34_1479_4753" / "images" / "frame000005.png").unlink()
+    config = _captures(root)
+    with pytest.raises(InputError, match=r"frame000005\.png is missing"):
+        freeze(config, _RULES, open_captures(config, []))
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ from plyfile import PlyData
 
 from extrap_train.data import co3d
 from extrap_train.data.co3d import list_categories, read_category, read_sequence
-from extrap_train.errors import InputError
 from extrap_train.geometry.cameras import project
 
 
@@ -49,13 +48,24 @@ def test_the_point_cloud_and_the_quality_are_found(root):
     assert {"x", "y", "z", "red", "green", "blue"} <= set(vertices.data.dtype.names)
 
 
-def test_a_point_cloud_that_a_link_leads_to_from_outside_is_refused(root, tmp_path_factory):
+def test_a_point_cloud_may_lie_on_another_disk(root, tmp_path_factory):
     cloud = root / "cup" / "two" / "pointcloud.ply"
     outside = cloud.rename(tmp_path_factory.mktemp("outside") / "cloud.ply")
     assert read_sequence(root, "cup", "two").point_cloud.find() is None
     cloud.symlink_to(outside)
-    with pytest.raises(InputError, match="leads out of"):
-        read_sequence(root, "cup", "two").point_cloud.find()
+    assert read_sequence(root, "cup", "two").point_cloud.find().samefile(outside)
+
+
+def test_categories_and_sequences_may_lie_on_other_disks(root, tmp_path_factory):
+    expected = read_sequence(root, "cup", "two").frames[0].load()
+    disk = tmp_path_factory.mktemp("disk")
+    for folder in (root / "cup" / "two", root / "cup" / "one" / "images", root / "cup"):
+        moved = folder.rename(disk / f"moved {folder.name}")
+        folder.symlink_to(moved)
+    found = read_sequence(root, "cup", "two").frames[0].load()
+    assert torch.equal(found.image, expected.image)
+    assert torch.equal(found.depth, expected.depth)
+    assert len(read_sequence(root, "cup", "one").frames[0].load().image) == 3
 
 
 def test_the_same_views_give_the_same_bytes(tmp_path):

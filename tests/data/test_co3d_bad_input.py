@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import zlib
 
 import numpy as np
 import pytest
@@ -62,7 +63,7 @@ def test_no_frame_with_a_camera(root):
 def test_missing_sequence_annotations(root):
     (root / "cup" / "sequence_annotations.jgz").unlink()
     message = complaint(read_category, root, "cup")
-    assert "sequence_annotations.jgz: no such file; is the download complete" in message
+    assert "sequence_annotations.jgz: no such file" in message
 
 
 def test_truncated_annotations(root):
@@ -84,7 +85,7 @@ def test_annotations_that_are_not_gzip(root):
     assert f"{ANNOTATIONS}: is not a gzip file" in complaint(read_category, root, "cup")
 
 
-@pytest.mark.parametrize("content", [b"[{]", b"\xff\xfe\x00", b"[" * 100_000])
+@pytest.mark.parametrize("content", [b"[{]", b"\xff\xfe\x00", b"[" * 10_000])
 def test_annotations_that_are_not_json(root, content):
     (root / "cup" / ANNOTATIONS).write_bytes(gzip.compress(content))
     assert f"{ANNOTATIONS}: is not valid JSON" in complaint(read_category, root, "cup")
@@ -93,7 +94,7 @@ def test_annotations_that_are_not_json(root, content):
 def test_gzip_bomb(root):
     bomb = gzip.compress(b"[" + b" " * (2 * GZIP_FLOOR_BYTES))
     (root / "cup" / ANNOTATIONS).write_bytes(bomb)
-    assert "expands to more than" in complaint(read_category, root, "cup")
+    assert "holds more than" in complaint(read_category, root, "cup")
 
 
 @pytest.mark.parametrize(
@@ -139,14 +140,6 @@ def test_paths_that_leave_the_root(root, kind, path):
     replace_frame_entries(root, [entry])
     if path or kind == "image":
         assert "climbs out of its folder" in complaint(read_category, root, "cup")
-
-
-def test_symbolic_links_that_leave_the_root(root, tmp_path_factory):
-    outside = tmp_path_factory.mktemp("outside") / "x.jpg"
-    image = root / frame_entries(root)[0]["image"]["path"]
-    image.rename(outside)
-    image.symlink_to(outside)
-    assert "frame000001.jpg: leads out of" in complaint(load_first, root)
 
 
 @pytest.mark.parametrize(
@@ -252,13 +245,13 @@ def test_depth_that_is_zero_everywhere(root):
     assert "depth=stereo" in complaint(load_first, root)
 
 
-@pytest.mark.parametrize("scale", [float("nan"), float("inf"), 0.0, -1.0])
+@pytest.mark.parametrize("scale", [float("nan"), float("inf"), 0.0, -1.0, 1e30])
 def test_a_scale_of_depth_that_is_no_positive_number(root, scale):
     entry = frame_entries(root)[0]
     entry["depth"]["scale_adjustment"] = scale
     replace_frame_entries(root, [entry])
     message = complaint(load_first, root)
-    assert f"geometric.png: the scale of its depth is {scale}, no positive number" in message
+    assert f"geometric.png: the scale of its depth is {scale}, no possible one" in message
     assert "depth=stereo" in message
 
 
@@ -270,6 +263,111 @@ def test_depth_that_is_not_asked_for_is_not_read(root):
     assert without.depth is None
     np.testing.assert_array_equal(without.image, whole.image)
     np.testing.assert_array_equal(without.mask, whole.mask)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("focal_length", [1e30, 1]),
+        ("focal_length", [1, 1e-9]),
+        ("focal_length", [True, 1]),
+        ("principal_point", [1e6, 0]),
+        ("principal_point", [0, -1e6]),
+        ("R", [[True, 0, 0], [0, 1, 0], [0, 0, 1]]),
+        ("T", [False, 0, 3]),
+    ],
+)
+def test_nonsense_costs_its_frame_alone(tmp_path, key, value):
+    write_capture(tmp_path, names=("one",), frames=4)
+    entries = frame_entries(tmp_path)
+    entries[1]["viewpoint"][key] = value
+    replace_frame_entries(tmp_path, entries)
+    (sequence,) = read_category(tmp_path, "cup")
+    assert (len(sequence.frames), len(sequence.left_out)) == (3, 1)
+    assert "degenerate" in sequence.left_out[0]
+
+
+def test_a_depth_scale_that_is_a_truth_value_is_none(root):
+    entry = frame_entries(root)[0]
+    entry["depth"]["scale_adjustment"] = True
+    replace_frame_entries(root, [entry])
+    assert "the scale of its depth is nan" in complaint(load_first, root)
+
+
+@pytest.mark.parametrize(("old", "new"), [("/", "/./"), ("/", "//"), ("images/", "images/././")])
+def test_an_image_that_is_listed_twice_in_other_words(root, old, new):
+    (entry,) = frame_entries(root)
+    again = json.loads(json.dumps(entry)) | {"frame_number": 99}
+    again["image"]["path"] = entry["image"]["path"].replace(old, new, 1)
+    replace_frame_entries(root, [entry, again])
+    assert "sequence one lists an image twice" in complaint(read_category, root, "cup")
+
+
+def _viewpoint_of_junk(entry):
+    return entry | {"viewpoint": entry["viewpoint"] | {"junk": ["[]"] * 20_000}}
+
+
+@pytest.mark.parametrize(
+    "grow",
+    [
+        lambda entry: entry | {"meta": [[]] * 30_000},
+        lambda entry: entry | {"sequence_name": "n" * 70_000},
+        _viewpoint_of_junk,
+    ],
+)
+def test_an_entry_without_measure_is_refused(root, grow):
+    (entry,) = frame_entries(root)
+    replace_frame_entries(root, [entry, grow(entry)])
+    assert "has an entry of more than" in complaint(read_category, root, "cup")
+
+
+def test_one_endless_entry_is_not_parsed(root):
+    """A megabyte of gzip, which took five gigabytes."""
+    packer = zlib.compressobj(9, zlib.DEFLATED, 31)
+    out = packer.compress(b'[{"meta":[')
+    for _ in range(16):
+        out += packer.compress(b"[]," * 2**20)
+    (root / "cup" / ANNOTATIONS).write_bytes(out + packer.compress(b"[]]}]") + packer.flush())
+    assert ANNOTATIONS in complaint(read_category, root, "cup")
+
+
+def _as_challenge(root, kind):
+    """Every third frame a hidden target, black as CO3D has them."""
+    entries = frame_entries(root)
+    for entry in entries:
+        hidden = entry["frame_number"] % 30 == 21
+        entry["meta"] = {"frame_type": kind if hidden else "train_known"}
+        if hidden:
+            for part in ("image", "mask", "depth"):
+                file = root / entry[part]["path"]
+                picture = Image.open(file)
+                Image.new(picture.mode, picture.size).save(file)
+    replace_frame_entries(root, entries)
+
+
+@pytest.mark.parametrize("kind", ["test_unseen", "dev_unseen", "train_unseen"])
+def test_black_targets_of_the_challenge_are_left_out_as_known(tmp_path, kind):
+    write_capture(tmp_path, names=("one", "two"), frames=9)
+    _as_challenge(tmp_path, kind)
+    for sequence in read_category(tmp_path, "cup"):
+        assert (len(sequence.frames), sequence.left_out) == (6, ())
+        for frame in sequence.frames:
+            frame.load()
+
+
+def test_unseen_frames_with_a_picture_are_frames(tmp_path):
+    """In the first release, and in the development sets of the second, they are photographs."""
+    write_capture(tmp_path, names=("one",), frames=3, size=96)
+    entries = frame_entries(tmp_path)
+    replace_frame_entries(tmp_path, [e | {"meta": {"frame_type": "dev_unseen"}} for e in entries])
+    (sequence,) = read_category(tmp_path, "cup")
+    assert len(sequence.frames) == 3
+
+
+@pytest.mark.parametrize("meta", [None, [], "test_unseen", {"frame_type": None}, {"x": 1}])
+def test_other_notes_on_a_frame_mean_nothing(root, meta):
+    replace_frame_entries(root, [frame_entries(root)[0] | {"meta": meta}])
+    assert len(read_category(root, "cup")[0].frames) == 1
 
 
 def test_mask_that_is_black_everywhere(root):

@@ -10,7 +10,7 @@ from captures import view_at
 from PIL import Image
 from two_views import epipolar_distances
 
-from extrap_train.data.colmap_model import read_model
+from extrap_train.data.colmap_model import find_model, read_model
 from extrap_train.data.colmap_text import read_text_images
 from extrap_train.errors import InputError
 from extrap_train.geometry.colmap import colmap_from_world_to_cam
@@ -104,7 +104,7 @@ def test_entries_without_a_picture_are_reported(model, caplog):
     (model / "images" / "at 30.png").unlink()
     with caplog.at_level(logging.WARNING):
         assert len(read(model).frames) == 2
-    assert "1 of 3 entries have no picture" in caplog.records[0].getMessage()
+    assert "only 2 of the 3 pictures" in caplog.records[0].getMessage()
 
 
 def test_files_cut_anywhere_are_refused_or_read_in_part(model):
@@ -145,7 +145,7 @@ def binary(tmp_path, camera_number=7, model_number=PINHOLE, name=b"a.png", count
         ({"count": 2**63}, "cameras.bin: is truncated or damaged"),
         ({"points": 2**62}, "images.bin: is truncated or damaged"),
         ({"camera_number": 8}, "a.png names camera 7, which the model does not have"),
-        ({"model_number": 7}, "camera model 7 is none of SIMPLE_PINHOLE"),
+        ({"model_number": 99}, "has the number 99"),
         ({"name": b"../a.png"}, "climbs out of its folder"),
         ({"name": b"/a.png"}, "climbs out of its folder"),
         ({"name": b"\xff"}, "is not UTF-8"),
@@ -163,7 +163,7 @@ def test_binary_files_that_lie(tmp_path, lie, expected):
         ("cameras.txt", "7 PINHOLE 40 32 50 50 20", "has 3 parameters"),
         ("cameras.txt", "7 PINHOLE 40 x 50 50 20 16", "cameras.txt: line 1 is malformed"),
         ("cameras.txt", "7 PINHOLE 0 32 50 50 20 16", "size 32 x 0"),
-        ("cameras.txt", "7 FOV 40 32 50 50 20 16 1", "camera model FOV is none of"),
+        ("cameras.txt", "7 FOV 40 32 50 50 20 16 1", "is of the model FOV, and only"),
         (
             "cameras.txt",
             "7 PINHOLE 40 32 50 50 20 16\n7 PINHOLE 40 32 9 9 20 16",
@@ -184,6 +184,131 @@ def test_text_files_that_make_no_sense(tmp_path, file, line, expected):
     assert len(read(tmp_path).frames) == 1
     (tmp_path / file).write_text(line)
     assert expected in complaint(tmp_path)
+
+
+@pytest.fixture
+def text_model(tmp_path):
+    """Four pictures of two cameras, the second of which no picture uses."""
+    (tmp_path / "images").mkdir()
+    entries = [Entry(f"{azimuth:02d}.png", view_at(azimuth).camera) for azimuth in (0, 20, 40, 60)]
+    for entry in entries:
+        Image.new("RGB", (40, 32)).save(tmp_path / "images" / entry.name)
+    write_text(tmp_path, entries)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "model", ["FOV 40 32 50 50 20 16 1", "EUCM 1 1 1 1 1 1 1 1", "X 0 0", "PINHOLE 40 32 1"]
+)
+def test_a_camera_that_no_picture_uses_does_not_matter(text_model, model):
+    with (text_model / "cameras.txt").open("a") as file:
+        file.write(f"8 {model}\n")
+    assert len(read(text_model).frames) == 4
+
+
+def test_a_binary_camera_that_no_picture_uses_does_not_matter(tmp_path):
+    """Other models have other numbers of parameters, which are skipped."""
+    binary(tmp_path)
+    sizes = {7: 5, 10: 12, 11: 16, 12: 4, 13: 5, 16: 6, 17: 2}
+    content = struct.pack("<Q", len(sizes) + 1)
+    for number, size in sizes.items():
+        content += struct.pack(f"<iiQQ{size}d", 100 + number, number, 40, 32, *[1.0] * size)
+    own = (tmp_path / "cameras.bin").read_bytes()[8:]
+    (tmp_path / "cameras.bin").write_bytes(content + own)
+    assert len(read(tmp_path).frames) == 1
+
+
+@pytest.mark.parametrize("pose", ["nan 0 0 0 0 0 3", "1 0 0 0 -inf 0 3", "0 0 0 0 0 0 3"])
+def test_a_bad_pose_costs_its_picture_alone(text_model, pose):
+    file = text_model / "images.txt"
+    lines = file.read_text().splitlines()
+    lines[3] = f"2 {pose} 7 20.png"
+    file.write_text("\n".join(lines) + "\n")
+    sequence = read(text_model)
+    assert [frame.name for frame in sequence.frames] == ["00.png", "40.png", "60.png"]
+    assert "20.png" in sequence.left_out[0]
+
+
+@pytest.mark.parametrize(
+    ("model", "name"),
+    [(7, "FOV"), (10, "THIN_PRISM_FISHEYE"), (12, "SIMPLE_DIVISION"), (17, "EQUIRECTANGULAR")],
+)
+def test_models_that_cannot_be_undone_are_named(tmp_path, model, name):
+    binary(tmp_path)
+    camera = struct.pack("<QiiQQ", 1, 7, model, 40, 32) + struct.pack("<16d", *[1.0] * 16)
+    (tmp_path / "cameras.bin").write_bytes(camera)
+    assert f"is of the model {name}, and only" in complaint(tmp_path)
+
+
+@pytest.mark.parametrize(("number", "parameters"), [(14, [30.0, 20, 16]), (15, [30.0, 30, 20, 16])])
+def test_equidistant_fisheyes(tmp_path, number, parameters):
+    """r = f θ: a direction 0.4 rad off the axis is shown 12 pixels from the centre."""
+    binary(tmp_path)
+    camera = struct.pack("<QiiQQ", 1, 7, number, 40, 32)
+    camera += struct.pack(f"<{len(parameters)}d", *parameters)
+    (tmp_path / "cameras.bin").write_bytes(camera)
+    picture = np.zeros((32, 40, 3), np.uint8)
+    picture[15:17, 31:33] = 255  # around (32, 16)
+    Image.fromarray(picture).save(tmp_path / "images" / "a.png")
+    view = read(tmp_path).frames[0].load()
+    weight = view.image[0] / view.image[0].sum()
+    column = float((weight.sum(0) * (torch.arange(40) + 0.5)).sum())
+    fx, cx = view.camera.intrinsics[0, 0].item(), view.camera.intrinsics[0, 2].item()
+    assert (column - cx) / fx == pytest.approx(np.tan(0.4), abs=0.01)
+
+
+@pytest.mark.parametrize("factor", [0.5, 0.25, 2])
+def test_pictures_of_another_size_scale_the_lens(text_model, factor):
+    for picture in (text_model / "images").iterdir():
+        Image.new("RGB", (round(40 * factor), round(32 * factor))).save(picture)
+    for frame in read(text_model).frames:
+        expected = view_at(0).camera.resized(round(32 * factor), round(40 * factor))
+        torch.testing.assert_close(frame.camera.intrinsics, expected.intrinsics)
+        assert frame.load().image.shape[1:] == (32 * factor, 40 * factor)
+
+
+def test_pictures_of_another_shape_are_no_other_size(text_model):
+    Image.new("RGB", (32, 40)).save(text_model / "images" / "00.png")
+    with pytest.raises(InputError, match="32 x 40"):
+        read(text_model).frames[0].load()
+
+
+def test_names_written_elsewhere_are_found(text_model):
+    (text_model / "images" / "00.png").rename(text_model / "images" / "00.PNG")
+    (text_model / "images" / "left").mkdir()
+    (text_model / "images" / "20.png").rename(text_model / "images" / "left" / "20.png")
+    file = text_model / "images.txt"
+    file.write_text(file.read_text().replace("20.png", "left\\20.png"))
+    assert len(read(text_model).frames) == 4
+
+
+def test_what_is_there_instead_is_said(text_model):
+    for picture in (text_model / "images").iterdir():
+        picture.rename(picture.with_suffix(".jpg"))
+    assert "there is no 00.png; there is 00.jpg" in complaint(text_model)
+
+
+def test_camera_to_world_poses_are_named(text_model):
+    file = text_model / "images.txt"
+    lines = file.read_text().splitlines()
+    for index, azimuth in enumerate((0, 20, 40, 60)):
+        inverse = view_at(azimuth).camera.cam_to_world
+        quaternion, translation = colmap_from_world_to_cam(inverse.double())
+        pose = " ".join(map(repr, [*quaternion.tolist(), *translation.tolist()]))
+        lines[1 + 2 * index] = f"{index} {pose} 7 {azimuth:02d}.png"
+    file.write_text("\n".join(lines) + "\n")
+    assert "must be world-to-camera" in complaint(text_model)
+
+
+def test_the_largest_of_several_models_is_read(tmp_path, caplog):
+    entries = [Entry(f"{azimuth:02d}.png", view_at(azimuth).camera) for azimuth in (0, 20, 40)]
+    for number, part in (("0", entries[:1]), ("1", entries), ("10", entries[:2])):
+        (tmp_path / "sparse" / number).mkdir(parents=True)
+        (write_text if number == "1" else write_binary)(tmp_path / "sparse" / number, part)
+    with caplog.at_level(logging.WARNING):
+        assert find_model(tmp_path) == tmp_path / "sparse" / "1"
+    assert "0 has 1, 10 has 2" in caplog.text
+    assert find_model(tmp_path / "sparse" / "0") == tmp_path / "sparse" / "0"
 
 
 def test_empty_lines_around_the_text_mean_nothing(tmp_path):

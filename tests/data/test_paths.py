@@ -27,7 +27,7 @@ def test_other_paths_are_refused(path):
 
 @pytest.mark.parametrize(
     "path",
-    ["x" * 256, "a/" + "ü" * 128, "a/" * 3000 + "a", "a\ud800", "a\udc80", "a\nb", "a\x1b[2Jb"],
+    ["x" * 256, "a/" + "ü" * 128, "a/" * 3000 + "a", "a\ud800", "a\nb", "a\x1b[2Jb"],
 )
 def test_names_that_no_file_has_are_refused(path):
     with pytest.raises(InputError, match=r"list\.json: the path .* correct") as refused:

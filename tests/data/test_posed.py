@@ -117,7 +117,9 @@ def test_entries_without_a_picture_are_reported(folder, caplog):
         sequence = read_transforms(folder)
     assert len(sequence.frames) == 2
     (record,) = caplog.records
-    assert "1 of 3 entries have no picture and are left out: images/001.png" in record.getMessage()
+    assert "only 2 of the 3 pictures" in record.getMessage()
+    assert "images/001.png" in record.getMessage()
+    assert sequence.listed == ("000.png", "001.png", "002.png")
 
 
 def test_no_picture_at_all(folder):
@@ -143,14 +145,130 @@ def test_the_suffix_of_a_picture_may_be_left_out(folder, stem):
     assert Path(stem).name in [frame.name for frame in read_transforms(folder).frames]
 
 
-def test_a_picture_outside_is_not_even_measured(folder):
-    picture = folder / "images" / "001.png"
-    picture.symlink_to(picture.rename(folder.parent / "outside.png"))
+def test_folders_and_files_that_are_links_are_read(folder):
+    """As hubs, git-annex and DVC leave them, and as a full disk makes people do."""
     content = read_json(folder)
-    del content["h"], content["w"]
+    (folder / "images").rename(folder.parent / "disk")
+    (folder / "images").symlink_to(folder.parent / "disk")
+    for name in ("mask_000.png", "depth_000.png", "transforms.json"):
+        (folder / name).rename(folder.parent / f"blob {name}")
+        (folder / name).symlink_to(f"../blob {name}")
+    view = read_transforms(folder).frames[0].load()
+    torch.testing.assert_close(view.depth, view_at(0).depth, rtol=0, atol=6e-4)
+    assert len(content["frames"]) == 3
+
+
+def test_a_link_without_its_file_says_where_it_leads(folder):
+    (folder / "depth_000.png").unlink()
+    (folder / "depth_000.png").symlink_to(".git/annex/objects/x")
+    assert ".git/annex/objects/x" in complaint(folder)
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        lambda m: np.full((4, 4), np.nan),
+        lambda m: np.where(np.eye(4), -np.inf, m),
+        lambda m: np.zeros((4, 4)),
+        lambda m: m[:2],
+        lambda m: m.T,
+        lambda m: m * [[1], [1], [1], [0]],
+        lambda m: m @ np.diag([1, 1, -1, 1]),
+        lambda m: m @ np.diag([1, 2, 1, 1]),
+        lambda m: [["a"] * 4] * 4,
+    ],
+)
+def test_a_bad_pose_costs_its_frame_alone(folder, matrix, caplog):
+    content = read_json(folder)
+    frame = content["frames"][1]
+    bad = matrix(np.array(frame["transform_matrix"]))
+    frame["transform_matrix"] = bad if isinstance(bad, list) else bad.tolist()
     write_json(folder, content)
-    with pytest.raises(InputError, match=r"001\.png: leads out of"):
-        read_transforms(folder)
+    with caplog.at_level(logging.WARNING):
+        sequence = read_transforms(folder)
+    assert [frame.name for frame in sequence.frames] == ["000.png", "002.png"]
+    assert len(sequence.left_out) == 1
+    assert "images/001.png" in sequence.left_out[0]
+    assert sequence.left_out[0] in caplog.text
+    assert sequence.listed == ("000.png", "001.png", "002.png")
+
+
+@pytest.mark.parametrize(
+    "scaled",
+    [
+        lambda m: m * 2,
+        lambda m: m @ np.diag([1.5, 1.5, 1.5, 1]),
+        lambda m: np.concatenate([m[:3] * 0.5, [[0, 0, 0, 0.5]]]),
+        lambda m: m[:3],
+    ],
+)
+def test_a_scale_of_a_matrix_is_none_of_the_world(folder, scaled):
+    content = read_json(folder)
+    for frame in content["frames"]:
+        frame["transform_matrix"] = scaled(np.array(frame["transform_matrix"])).tolist()
+    write_json(folder, content)
+    for azimuth, frame in zip((0, 30, 60), read_transforms(folder).frames, strict=True):
+        expected = view_at(azimuth).camera.world_to_cam
+        torch.testing.assert_close(frame.camera.world_to_cam, expected)
+
+
+def test_transposed_matrices_are_named(folder):
+    content = read_json(folder)
+    for frame in content["frames"]:
+        frame["transform_matrix"] = np.transpose(frame["transform_matrix"]).tolist()
+    write_json(folder, content)
+    assert "column-major" in complaint(folder)
+
+
+def test_poses_of_another_convention_are_named(folder):
+    content = read_json(folder)
+    for frame in content["frames"]:
+        frame["transform_matrix"] = (
+            np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1])
+        ).tolist()
+    write_json(folder, content)
+    message = complaint(folder)
+    assert "must be camera-to-world in OpenGL's axes" in message
+    assert "camera-to-world in OpenCV's axes" in message
+
+
+@pytest.mark.parametrize("factor", [0.5, 2, 0.25])
+def test_pictures_of_another_size_scale_the_lens(folder, factor):
+    for picture in (folder / "images").iterdir():
+        image = Image.open(picture)
+        image.resize((round(image.width * factor), round(image.height * factor))).save(picture)
+    frame = read_transforms(folder).frames[0]
+    k = view_at(0).camera.intrinsics * factor
+    torch.testing.assert_close(frame.camera.intrinsics[:2], k[:2])
+    view = frame.load()
+    assert view.image.shape[1:] == view.depth.shape == (32 * factor, 40 * factor)
+
+
+def test_depth_as_instant_ngp_has_it(folder):
+    content = read_json(folder)
+    for frame in content["frames"]:
+        frame["depth_path"] = frame.pop("depth_file_path")
+    write_json(folder, content | {"integer_depth_scale": 0.001, "applied_scale": 7.0})
+    depth = read_transforms(folder).frames[0].load().depth
+    torch.testing.assert_close(depth, view_at(0).depth, rtol=0, atol=6e-4)
+    write_json(folder, content)
+    assert "integer_depth_scale" in complaint(folder)
+
+
+def test_paths_written_on_windows(folder):
+    content = read_json(folder)
+    for frame in content["frames"]:
+        frame["file_path"] = f".\\images\\{frame['file_path'][-7:]}"
+        frame["mask_path"] = f".\\{frame['mask_path']}"
+    write_json(folder, content)
+    torch.testing.assert_close(read_transforms(folder).frames[0].load().mask, view_at(0).mask)
+
+
+def test_a_name_in_another_case_is_the_descriptions(folder):
+    (folder / "images" / "001.png").rename(folder / "images" / "001.PNG")
+    sequence = read_transforms(folder)
+    assert [frame.name for frame in sequence.frames] == ["000.png", "001.png", "002.png"]
+    assert sequence.frames[1].files[0].name == "001.PNG"
 
 
 def test_lens_distortion_is_undone(folder):
@@ -221,36 +339,46 @@ def test_pictures_of_the_same_name_in_two_folders(folder):
         ({"mask_path": "../x.png"}, "climbs out of its folder"),
         ({"transform_matrix": [[1, 2], [3, 4]]}, "has shape (2, 2)"),
         ({"transform_matrix": "none"}, "is malformed"),
-        ({"transform_matrix": np.zeros((4, 4)).tolist()}, "is degenerate"),
+        ({"transform_matrix": np.diag([0, 0, 0, 1]).tolist()}, "is degenerate"),
+        ({"transform_matrix": np.zeros((4, 4)).tolist()}, "the last row of transform_matrix"),
         ({"transform_matrix": np.full((4, 4), float("nan")).tolist()}, "is degenerate"),
         ({"fl_x": 0}, "is degenerate"),
         ({"fl_x": 0, "k1": 0.1}, "is degenerate"),
         ({"fl_y": -30, "k1": 0.1}, "is degenerate"),
-        ({"file_path": "n" * 253}, "has too long a name"),
+        ({"file_path": "n" * 256}, "has too long a name"),
+        ({"file_path": "n" * 253}, "none of the 1 pictures"),
         ({"fl_x": float("nan")}, "the lens of images/000.png is not finite"),
         ({"fl_x": "wide"}, "is malformed"),
         ({"fl_x": 10**400}, "is malformed"),
         ({"transform_matrix": [[10**400] * 4] * 4}, "is malformed"),
-        ({"camera_model": "EQUIRECTANGULAR"}, "camera model 'EQUIRECTANGULAR' is none of"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model 'EQUIRECTANGULAR' is none of"),
         ({"k1": 1e6}, "cannot be undone"),
-        ({"w": 41}, "is 32 x 40 pixels"),
+        ({"w": 60}, "is 32 x 40 pixels"),
         ({"w": -1}, "image size 32 x -1"),
         ({"depth_file_path": "gone.png"}, "gone.png: no such file"),
-        ({"file_path": "images/001.png"}, "lists a picture twice"),
     ],
 )
 def test_bad_entries(folder, change, expected):
     content = read_json(folder)
-    content["frames"][0] |= change
-    write_json(folder, content)
+    write_json(folder, content | {"frames": [content["frames"][0] | change]})
     assert expected in complaint(folder)
+
+
+@pytest.mark.parametrize("again", ["images/001.png", "./images/./001.png", "images\\001.png"])
+def test_a_picture_that_is_listed_twice(folder, again):
+    content = read_json(folder)
+    content["frames"][0]["file_path"] = again
+    write_json(folder, content)
+    assert "lists images/001.png twice" in complaint(folder)
 
 
 def test_missing_intrinsics_and_pose(folder):
     content = read_json(folder)
-    del content["frames"][0]["fl_x"]
+    content["frames"] = content["frames"][:1]
+    for key in ("fl_x", "fl_y"):
+        del content["frames"][0][key]
     write_json(folder, content)
-    assert "images/000.png has 'camera_angle_x'; add it" in complaint(folder)
+    assert "images/000.png has 'fl_x'; add it" in complaint(folder)
     del content["frames"][0]["transform_matrix"]
     content["camera_angle_x"] = 1.0
     write_json(folder, content)

@@ -45,4 +45,4 @@ def test_every_camera_model_becomes_a_lens(model):
     assert lens.fy == values.get("f", values.get("fy"))
     k1_first = values.get("k1", 0.0)
     assert lens.distortion[0] == k1_first
-    assert lens.is_pinhole == (k1_first == 0)
+    assert lens.is_pinhole == (k1_first == 0 and not model.fisheye)
