@@ -16,7 +16,7 @@ from plyfile import PlyData, PlyParseError
 from torch import Tensor
 
 from extrap_train.data.images import ARRAY_ERRORS, to_eight_bits
-from extrap_train.data.picture_files import DECODER_ERRORS, MAX_PIXELS
+from extrap_train.data.picture_files import DECODER_ERRORS, is_readable_size
 from extrap_train.errors import InputError
 
 
@@ -43,7 +43,7 @@ def images_of(pictures: Mapping[str, bytes]) -> Float[Tensor, "n 3 h w"]:
 def _decode_png(name: str, content: bytes) -> UInt8[np.ndarray, "h w 3"]:
     try:
         picture = Image.open(io.BytesIO(content), formats=("PNG",))
-        if picture.mode == "RGB" and picture.width * picture.height <= MAX_PIXELS:
+        if picture.mode == "RGB" and is_readable_size(picture):
             return np.array(picture)
     except DECODER_ERRORS:
         pass

@@ -18,6 +18,8 @@ FORMATS = ("BMP", "GIF", "JPEG", "PNG", "PPM", "TIFF", "WEBP")
 """What is decoded, whatever a file is called: none of these starts another program."""
 MAX_PIXELS = 100_000_000
 """Larger than any camera's photograph; a size from outside beyond it is an error or an attack."""
+MAX_SIDE = 65_535
+"""JPEG's own limit."""
 DECODER_ERRORS = (
     *(OSError, SyntaxError, ValueError, EOFError, TypeError, LookupError, ArithmeticError),
     *(struct.error, AttributeError, Image.DecompressionBombError),
@@ -41,6 +43,8 @@ _MOST_ROUNDING = 0.05
 _HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 
 log = logging.getLogger(__name__)
+# Of damaged EXIF, or sizes below the limit here: what matters is said in one line by this module.
+warnings.filterwarnings("ignore", module=r"PIL\.")
 
 
 def open_picture(path: Path) -> Image.Image:
@@ -52,10 +56,7 @@ def open_picture(path: Path) -> Image.Image:
     require_file(path)
     try:
         formats = ("HEIF",) if _is_heic(path) else FORMATS
-        with warnings.catch_warnings():
-            # The limit below is stricter than what Pillow warns of.
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            picture = Image.open(path, formats=formats)
+        picture = Image.open(path, formats=formats)
     except PermissionError:
         raise InputError(f"{path}: you may not read this file; change its permissions") from None
     except InputError:
@@ -65,12 +66,18 @@ def open_picture(path: Path) -> Image.Image:
             f"{path}: cannot be read as a picture ({', '.join(FORMATS)}); restore or convert it, "
             "or remove its entry"
         ) from None
-    if not 0 < picture.width * picture.height <= MAX_PIXELS:
+    if not is_readable_size(picture):
         raise InputError(
-            f"{path}: has {picture.height} x {picture.width} pixels, and only 1 to {MAX_PIXELS:,} "
-            "can be read; resize the picture or remove its entry"
+            f"{path}: has {picture.height} x {picture.width} pixels, and only 1 to {MAX_PIXELS:,}, "
+            f"at most {MAX_SIDE:,} a side, can be read; resize the picture or remove its entry"
         )
     return picture
+
+
+def is_readable_size(picture: Image.Image) -> bool:
+    """Whether a picture's header says nothing that would cost too much memory to decode."""
+    width, height = picture.size
+    return max(width, height) <= MAX_SIDE and 0 < width * height <= MAX_PIXELS
 
 
 def image_size(path: Path, annotated: tuple[int, int] | None = None) -> tuple[int, int]:
