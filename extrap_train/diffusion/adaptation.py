@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,6 +27,8 @@ _LEVELS = 4
 """Of noise, at most, at which what is held out is measured; a long schedule is taken in strides."""
 _DRAWS = 8
 """Of noise at every level, shared among the held-out pairs."""
+_MEASURING_SHARE = 0.1
+"""Of the time budget, at most, for measuring once what is held out."""
 _WARMUP = 20
 """Steps until the full learning rate."""
 _AVERAGE_DECAY = 0.98
@@ -69,16 +71,23 @@ def adapt(
 
     Candidates are moving averages: the base is one, and single steps away from it are noisier than
     what they learn. The best has the least error on the held-out pairs, measured with fixed noise
-    at levels that the sampler steps through. `on_step` hears of every step and the share of the
-    budget that is spent. Steps are a function of the seed; how many depends on the clock.
+    at levels that the sampler steps through: fewer of them where measuring all would take more than
+    a tenth of the budget. `on_step` hears of step 0, the base measured, and of every step, with the
+    share of the budget that is spent. Steps are a function of the seed; how many depends on the
+    clock.
     """
     started = clock()
+
+    def spent() -> float:
+        return (clock() - started) / seconds
+
     trained = [weight for weight in model.parameters() if weight.requires_grad]
     rate = options.learning_rate or model.config.learning_rate
     # Set up by Fabric: with fp16 its steps undo the loss's scale.
     optimizer: Any = fabric.setup_optimizers(torch.optim.AdamW(trained, lr=rate, weight_decay=0.0))
     anchored = adapter.disable_adapter if options.virtual_references else None
     measure = _HeldOut(model, pairs.held_out_batch(), options.batch_size, sampler, fabric, anchored)
+    measure.fit_into(_MEASURING_SHARE * seconds, clock)
     dropout = _CONDITION_DROPOUT if sampler.guidance != 1 else 0.0
     losses = [(0, measure())]
     if not math.isfinite(losses[0][1]):
@@ -86,10 +95,11 @@ def adapt(
             "the model's error on the scene's own views is not finite (NaN); either its weights "
             "are not: give other weights=, or trainer.precision is too low: give 32-true"
         )
+    on_step(0, spent())
     average = _weights(adapter)
     best, best_step = _weights(adapter), 0
     step, ended = 0, "steps"
-    while step < options.steps:
+    while step < options.steps and spent() < 1:
         optimizer.param_groups[0]["lr"] = rate * min(1.0, (step + 1) / _WARMUP)
         rng = np.random.default_rng((seed, step))
         batch = pairs.training_batch(options.batch_size, rng)
@@ -105,21 +115,19 @@ def adapt(
         newest = _weights(adapter)
         for name, value in average.items():
             value.lerp_(newest[name], 1 - min(_AVERAGE_DECAY, (1 + step) / (10 + step)))
-        spent = (clock() - started) / seconds
-        on_step(step, spent)
-        if step % options.validate_every and spent < 1:
+        on_step(step, spent())
+        if step % options.validate_every and step < options.steps and spent() < 1:
             continue
         peft.set_peft_model_state_dict(adapter, average)
         losses.append((step, measure()))
         if losses[-1][1] < min(loss for _, loss in losses[:-1]):
             best, best_step = _weights(adapter), step
         peft.set_peft_model_state_dict(adapter, newest)
-        if spent >= 1:
-            ended = "time"
-            break
         if step - best_step >= options.patience * options.validate_every:
             ended = "held-out pair"
             break
+    if ended == "steps" and step < options.steps:
+        ended = "time"
     peft.set_peft_model_state_dict(adapter, best)
     return Adaptation(losses, best_step, step, clock() - started, ended)
 
@@ -129,6 +137,10 @@ def _anchor(batch: PairBatch, unchanged: Unchanged | None) -> Anchor | None:
         return None
     assert batch.warp is not None
     return Anchor(batch.warp.mask, unchanged)
+
+
+_Part = tuple[Tensor, Conditioning, Anchor | None]
+"""Of the held-out pairs: targets, what the denoiser is told, and what their holes are held to."""
 
 
 class _HeldOut:
@@ -145,28 +157,38 @@ class _HeldOut:
     ) -> None:
         self.model, self.fabric, self.unchanged = model, fabric, unchanged
         levels = sampling_timesteps(model.schedule, sampler)
-        self.levels = levels[:: -(-len(levels) // _LEVELS)].to(fabric.device)
-        self.draws = -(-_DRAWS // len(batch.image))
+        levels = levels[:: -(-len(levels) // _LEVELS)].to(fabric.device)
+        draws = -(-_DRAWS // len(batch.image))
         places = torch.arange(len(batch.image)).split(most_at_once)
-        self.parts = [self._part(_chosen(batch, part)) for part in places]
+        parts = [self._part(_chosen(batch, part)) for part in places]
+        self.taken = [(part, level) for part in parts for level in levels for _ in range(draws)]
 
     @torch.no_grad()
-    def _part(self, batch: PairBatch) -> tuple[Tensor, Conditioning, Anchor | None]:
+    def _part(self, batch: PairBatch) -> _Part:
         batch = with_warp(batch.to(self.fabric.device), self.model.config.image_size)
         with self.fabric.autocast():
             conditioning = self.model.condition(batch)
             target = self.model.encode_target(batch.image, conditioning)
         return target, conditioning, _anchor(batch, self.unchanged)
 
-    @torch.no_grad()
+    def fit_into(self, seconds: float, clock: Callable[[], float]) -> None:
+        """Measure on fewer noise levels and draws where all of them would take longer than this."""
+        for _ in range(2):  # the first evaluation also loads kernels
+            started = clock()
+            self._mean(self.taken[:1])
+            each = clock() - started
+            if each * len(self.taken) <= seconds:
+                return
+        stride = min(len(self.taken), math.ceil(len(self.taken) * each / seconds))
+        self.taken = self.taken[stride // 2 :: stride]
+
     def __call__(self) -> float:
+        return self._mean(self.taken)
+
+    @torch.no_grad()
+    def _mean(self, taken: Sequence[tuple[_Part, Int[Tensor, ""]]]) -> float:
         generator = torch.Generator().manual_seed(0)
-        errors = [
-            self._errors(target, conditioning, anchor, level, generator)
-            for target, conditioning, anchor in self.parts
-            for level in self.levels
-            for _ in range(self.draws)
-        ]
+        errors = [self._errors(*part, level, generator) for part, level in taken]
         return float(torch.cat(errors).mean())
 
     def _errors(

@@ -255,6 +255,47 @@ def test_it_ends_where_the_time_is_up(config: ModelConfig) -> None:
     assert timed.steps < 400
 
 
+@pytest.mark.parametrize(("steps", "every"), [(6, 4), (5, 25), (7, 3), (1, 2)])
+def test_the_last_step_is_measured_and_can_be_kept(
+    config: ModelConfig, steps: int, every: int
+) -> None:
+    _, done = _adapt(config, steps=steps, validate_every=every, learning_rate=3e-3, patience=100)
+    assert done.losses[-1][0] == done.steps == steps
+    assert done.best_step == min(done.losses, key=lambda found: found[1])[0]
+    assert done.ended == "steps"
+
+
+@pytest.mark.parametrize(("budget_s", "evaluations"), [(1e9, 12), (600.0, 6), (60.0, 1), (15.0, 1)])
+def test_a_slow_model_is_measured_less_so_that_the_budget_holds(
+    config: ModelConfig, budget_s: float, evaluations: int
+) -> None:
+    """Each run of the denoiser takes ten seconds of a clock; three pairs are measured at once."""
+    model, passed = _model(config), [0.0]
+
+    def tick(*_: object) -> None:
+        passed[0] += 5.0
+
+    model.unet.register_forward_pre_hook(tick)
+    heard: list[tuple[int, float]] = []
+    done = adapt(
+        model,
+        add_adapter(model, OPTIONS, seed=0),
+        adaptation_pairs(walls(3), 3, 8, seed=0),
+        replace(OPTIONS, steps=1),
+        SamplerConfig(steps=50),
+        seconds=budget_s,
+        seed=0,
+        fabric=Fabric(accelerator="cpu", devices=1),
+        on_step=lambda step, share: heard.append((step, share)),
+        clock=lambda: passed[0],
+    )
+    assert heard[0][0] == 0
+    tried_s = 20.0 if budget_s < 1e9 else 10.0
+    assert heard[0][1] * budget_s == pytest.approx(tried_s + 10.0 * evaluations)
+    assert done.steps == (1 if heard[0][1] < 1 else 0)
+    assert done.ended == ("steps" if done.steps else "time")
+
+
 def test_a_long_schedule_and_many_held_out_pairs_are_measured_a_batch_at_a_time(
     config: ModelConfig,
 ) -> None:
@@ -267,12 +308,13 @@ def test_a_long_schedule_and_many_held_out_pairs_are_measured_a_batch_at_a_time(
     sampler = SamplerConfig(steps=50)
     pairs = adaptation_pairs(walls(3), 3, options.virtual_references, seed=0)
     fabric = Fabric(accelerator="cpu", devices=1)
-    adapt(model, adapter, pairs, options, sampler, seconds=1e-6, seed=0, fabric=fabric)
+    adapt(model, adapter, pairs, options, sampler, seconds=1e9, seed=0, fabric=fabric)
     assert max(sizes) == 2
     views_levels_draws = 3 * 4 * 3
     with_and_without_adapter = 2
     measured = 2 * views_levels_draws  # before and after one step
-    assert sum(sizes) == with_and_without_adapter * (measured + 2)
+    timed, trained = 2, 2
+    assert sum(sizes) == with_and_without_adapter * (measured + timed + trained)
 
 
 @pytest.mark.parametrize("guidance", [1.0, 2.0])
@@ -294,5 +336,5 @@ def test_the_null_condition_is_trained_where_sampling_asks_for_it(
     pairs = adaptation_pairs(walls(2), 3, 2, seed=0)
     fabric = Fabric(accelerator="cpu", devices=1)
     sampler = SamplerConfig(guidance=guidance)
-    adapt(model, adapter, pairs, options, sampler, seconds=1e-6, seed=0, fabric=fabric)
+    adapt(model, adapter, pairs, options, sampler, seconds=1e9, seed=0, fabric=fabric)
     assert [share > 0 for share in asked] == [guidance != 1]
