@@ -84,10 +84,11 @@ class Tools:
 
 
 def _identity(tool: object) -> str:
-    return f"{tool!r} {[file_stamp(file) for file in _weight_files(tool)]}"
+    return f"{tool!r} {[file_stamp(file) for file in weight_files(tool)]}"
 
 
-def _weight_files(tool: object) -> list[Path]:
+def weight_files(tool: object) -> list[Path]:
+    """The files of weights that a depth source or a matcher reads."""
     match tool:
         case Mast3rConfig() | LoftrMatcherConfig() | AlikedMatcherConfig():
             return [Path(tool.checkpoint or "")]
@@ -95,7 +96,7 @@ def _weight_files(tool: object) -> list[Path]:
             # transformers takes seconds to load: only where it is wanted.
             from extrap_train.depth.depth_anything import files_read
 
-            return [*files_read(tool.model), *_weight_files(tool.matcher)]
+            return [*files_read(tool.model), *weight_files(tool.matcher)]
         case _:
             return []
 

@@ -169,6 +169,7 @@ class Co3dFrames(ListOf[Frame]):
             has_mask=photograph.mask_path is not None,
             load=photograph.load,
             files=photograph.files,
+            reading=f"depth in {self.depth_scale[index]}",
         )
 
     def _depth(self, index: int) -> DepthFiles | None:

@@ -218,6 +218,7 @@ def _frame(root: Path, photo: Photograph, name: str, description: Path) -> Frame
         has_mask=photo.mask_path is not None,
         load=loader.load,
         files=loader.files,
+        reading=f"{photo.lens}, depth in {photo.depth_scale}",
     )
 
 

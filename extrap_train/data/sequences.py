@@ -33,6 +33,9 @@ class Frame:
     load: Load
     files: tuple[Path, ...]
     """What `load` reads; none where it renders."""
+    reading: str = ""
+    """What else decides about what `load` returns, in words: the lens that it undoes, the unit of
+    depth files."""
 
 
 @dataclass(frozen=True)

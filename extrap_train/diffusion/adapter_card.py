@@ -1,13 +1,9 @@
 """What a saved adapter says of itself, in words and for programs: the scene it was made for."""
 
 import shlex
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
-
-DENOISER, OTHERS = "sha256", "others_sha256"
-"""Keys of the hashes of the weights that an adapter belongs to: the denoiser's, and those of the
-networks that tell it what to paint.
-"""
 
 
 @dataclass(frozen=True)
@@ -16,14 +12,32 @@ class AdapterOrigin:
 
     scene: str
     """Its address, the same from any folder."""
-    inputs: list[str]
-    """Names of the frames that it has learnt."""
+    photographs: Mapping[str, str]
+    """SHA-256 of the content of the frames that it was trained on, by their names."""
     weights: str
     """Model folder, or a packaged model's name."""
-    options: dict[str, Any]
+    options: Mapping[str, Any]
     """By dotted key."""
     outcome: str
     """How its training ended."""
+
+
+@dataclass(frozen=True)
+class BaseHashes:
+    """SHA-256 of the weights that an adapter belongs to."""
+
+    denoiser: str
+    others: str
+    """Of the networks that tell the denoiser what to paint."""
+
+
+@dataclass(frozen=True)
+class AdapterRecord(AdapterOrigin):
+    """`base.json` in an adapter's folder."""
+
+    base: BaseHashes
+    tensors: str
+    """SHA-256 of the file of the adapter's own tensors."""
 
 
 _CARD = """---
@@ -35,13 +49,13 @@ tags:
 # An adapter for one scene
 
 Low-rank additions to the denoiser of a view-extrapolation model, trained on photographs of one
-scene alone. It paints new views of that scene; others it may paint worse than the model does.
+scene alone. It paints new views of that scene; other scenes may come out worse than without it.
 
 | | |
 |---|---|
 {rows}
 
-`base.json` says the same for programs. The adapter is refused upon other weights than these.
+`base.json` says the same for programs. The adapter is refused on other weights than these.
 
 ## Use
 
@@ -59,24 +73,24 @@ Any `category` will do. In plain peft: `PeftModel.from_pretrained(unet, "FOLDER"
 """
 
 
-def model_card(origin: AdapterOrigin, hashes: dict[str, str]) -> str:
+def model_card(record: AdapterRecord) -> str:
     """The `README.md` of an adapter's folder."""
     rows = {
-        "scene": f"`{origin.scene}`",
-        "photographs": ", ".join(f"`{name}`" for name in origin.inputs),
-        "weights": f"`{origin.weights}`",
-        "SHA-256 of the denoiser": f"`{hashes[DENOISER]}`",
-        "SHA-256 of its other networks": f"`{hashes[OTHERS]}`",
-        "training": origin.outcome,
-        "options": ", ".join(f"`{name}={value}`" for name, value in origin.options.items()),
+        "scene": f"`{record.scene}`",
+        "photographs": ", ".join(f"`{name}`" for name in record.photographs),
+        "weights": f"`{record.weights}`",
+        "SHA-256 of the denoiser": f"`{record.base.denoiser}`",
+        "SHA-256 of its other networks": f"`{record.base.others}`",
+        "training": record.outcome,
+        "options": ", ".join(f"`{name}={value}`" for name, value in record.options.items()),
     }
     options = {
-        "weights": origin.weights,
-        "scene": origin.scene,
-        "input_frames": f"[{','.join(origin.inputs)}]",
+        "weights": record.weights,
+        "scene": record.scene,
+        "input_frames": f"[{','.join(record.photographs)}]",
     }
     return _CARD.format(
         rows="\n".join(f"| {name} | {value} |" for name, value in rows.items()),
         command=" ".join(shlex.quote(f"{name}={value}") for name, value in options.items()),
-        weights=origin.weights,
+        weights=record.weights,
     )

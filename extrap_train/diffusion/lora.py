@@ -1,35 +1,57 @@
 """A scene's adapter: low-rank additions to a denoiser's layers, saved apart from its weights."""
 
 import hashlib
-import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
 
 import peft
 import torch
+from pydantic import Field
 from safetensors import SafetensorError
 from safetensors.torch import load_file
-from torch import nn
+from torch import Tensor, nn
 
 from extrap_train.config import LoraConfig
-from extrap_train.diffusion.adapter_card import DENOISER, OTHERS, AdapterOrigin, model_card
+from extrap_train.diffusion.adapter_card import (
+    AdapterOrigin,
+    AdapterRecord,
+    BaseHashes,
+    model_card,
+)
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError
+from extrap_train.store.atomic import write_atomic
+from extrap_train.store.digests import file_digest
+from extrap_train.store.records import read_record, write_record
 
 _ATTENTION = ["to_q", "to_k", "to_v", "to_out.0"]
 _CONVOLUTIONS = ["conv1", "conv2"]
 _WEIGHTS = "adapter_model.safetensors"
 _OPTIONS = "adapter_config.json"
 _BASE = "base.json"
-"""Beside peft's files: the weights that the adapter was trained upon, and its `AdapterOrigin`."""
+"""An `AdapterRecord`, next to peft's files."""
 _CARD = "README.md"
+_REMEDY = "{} is no adapter folder of task=scene, or is damaged: make it again"
+_MAX_RANK = 1024
+
+_Target = Literal["to_q", "to_k", "to_v", "to_out.0", "conv1", "conv2"]
+
+
+@dataclass(frozen=True)
+class _SavedOptions:
+    """Of peft's options what `add_adapter` sets; others name modules to import."""
+
+    peft_type: Literal["LORA"]
+    r: Annotated[int, Field(ge=1, le=_MAX_RANK)]
+    lora_alpha: Annotated[int, Field(ge=1, le=_MAX_RANK)]
+    target_modules: Annotated[list[_Target], Field(min_length=1)]
 
 
 def add_adapter(model: ExtrapolationModel, options: LoraConfig, seed: int) -> peft.PeftModel:
-    """Put a new adapter upon the denoiser and let nothing else learn.
+    """Put a new adapter on the denoiser and let nothing else learn.
 
     It starts without effect. The base weights stay what they are, in memory and on disk;
     `PeftModel.unload` takes the adapter off again.
@@ -46,7 +68,7 @@ def add_adapter(model: ExtrapolationModel, options: LoraConfig, seed: int) -> pe
 def temporary_adapter(
     model: ExtrapolationModel, options: LoraConfig, seed: int
 ) -> Iterator[peft.PeftModel]:
-    """A new adapter upon the denoiser for as long as the block lasts, however it ends."""
+    """A new adapter on the denoiser for as long as the block lasts, however it ends."""
     adapter = add_adapter(model, options, seed)
     try:
         yield adapter
@@ -57,88 +79,100 @@ def temporary_adapter(
 def save_adapter(
     model: ExtrapolationModel, adapter: peft.PeftModel, folder: Path, origin: AdapterOrigin
 ) -> None:
-    """Write a peft adapter folder; `adapter` is what lies upon the model's denoiser.
+    """Write a peft adapter folder; `adapter` is what lies on the model's denoiser.
 
-    File by file: that all of it appears at once is for the result that it is part of.
+    File by file: that all of it appears at once is for the result that it is part of. Raises
+    InputError if the disk is full or closed.
     """
-    hashes = base_hashes(model)
-    adapter.save_pretrained(str(folder))
-    (folder / _BASE).write_text(json.dumps(hashes | asdict(origin), indent=1))
-    (folder / _CARD).write_text(model_card(origin, hashes))
-
-
-def saved_base_hashes(folder: Path) -> dict[str, str] | None:
-    """`base_hashes` of the weights that a saved adapter is for; None where there is no adapter."""
     try:
-        base = json.loads((folder / _BASE).read_text())
-        hashes = {key: base[key] for key in (DENOISER, OTHERS)}
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    return hashes if (folder / _WEIGHTS).is_file() else None
+        adapter.save_pretrained(str(folder))
+    except (OSError, SafetensorError) as error:
+        raise InputError(
+            f"{folder}: cannot be written ({error}); free space or choose another folder"
+        ) from None
+    tensors = file_digest(folder / _WEIGHTS)
+    record = AdapterRecord(**vars(origin), base=base_hashes(model), tensors=tensors)
+    write_record(folder / _BASE, record)
+    write_atomic(folder / _CARD, model_card(record).encode())
 
 
-def saved_origin(folder: Path) -> AdapterOrigin | None:
-    """What a saved adapter was made from; None where it does not say, as older ones."""
-    try:
-        base = json.loads((folder / _BASE).read_text())
-        return AdapterOrigin(**{field.name: base[field.name] for field in fields(AdapterOrigin)})
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+def adapter_bytes(adapter: peft.PeftModel) -> int:
+    """About how much disk the saved adapter takes."""
+    weights = peft.get_peft_model_state_dict(adapter).values()
+    return sum(x.numel() * x.element_size() for x in weights)
+
+
+def read_adapter_record(folder: Path) -> AdapterRecord:
+    """What a saved adapter was made from and belongs to; InputError if that is damaged."""
+    return read_record(folder / _BASE, AdapterRecord, _REMEDY.format(folder))
 
 
 def load_adapter(model: ExtrapolationModel, folder: Path) -> peft.PeftModel:
-    """Put a saved adapter upon the denoiser; InputError where it was trained upon other weights.
-
-    Older ones say nothing of other networks than the denoiser.
-    """
-    try:
-        base = json.loads((folder / _BASE).read_text())
-        wanted = {DENOISER: base[DENOISER]} | {k: base[k] for k in (OTHERS,) if k in base}
-        config = _saved_options(json.loads((folder / _OPTIONS).read_text()))
-        weights = load_file(folder / _WEIGHTS)
-    except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
-        reason = f"{type(error).__name__} {error}".splitlines()[0]
+    """Put a saved adapter on the denoiser; InputError if it was trained on other weights."""
+    remedy = _REMEDY.format(folder)
+    record = read_adapter_record(folder)
+    options = read_record(folder / _OPTIONS, _SavedOptions, remedy)
+    weights = _read_tensors(folder / _WEIGHTS, record.tensors, remedy)
+    if base_hashes(model) != record.base:
         raise InputError(
-            f"adapter={folder}: is no adapter folder of task=scene ({reason}); make it anew"
-        ) from None
-    own_hashes = base_hashes(model)
-    if any(own_hashes[key] != found for key, found in wanted.items()):
-        raise InputError(
-            f"adapter={folder}: was trained upon other weights than these; give weights= as it was "
-            "then, or adapt these with task=scene"
+            f"adapter={folder}: was trained on other weights than these; give the weights= it was "
+            "made for, or adapt these with task=scene"
         )
+    _require_rank(options, weights, folder / _OPTIONS, remedy)
+    config = peft.LoraConfig(
+        r=options.r,
+        lora_alpha=options.lora_alpha,
+        target_modules=list(options.target_modules),
+        inference_mode=True,
+    )
     adapter = peft.get_peft_model(model.unet, config)
     own = {name: x.shape for name, x in peft.get_peft_model_state_dict(adapter).items()}
     found = {name: x.shape for name, x in weights.items()}
     if odd := sorted(name for name in own | found if own.get(name) != found.get(name)):
         adapter.unload()
-        raise InputError(f"adapter={folder}: {len(odd)} tensors do not fit, first {odd[0]}")
+        raise InputError(
+            f"adapter={folder}: {len(odd)} tensors do not fit, first {odd[0]}; {remedy}"
+        )
     peft.set_peft_model_state_dict(adapter, weights)
     return adapter
 
 
-def _saved_options(saved: dict[str, Any]) -> peft.LoraConfig:
-    """Of what `add_adapter` may have set alone: peft's other options name modules to import."""
-    targets, rank, alpha = saved["target_modules"], saved["r"], saved["lora_alpha"]
-    if saved["peft_type"] != "LORA":
-        raise ValueError(f"peft_type is {saved['peft_type']}, not LORA")
-    if not set(targets) or not set(targets) <= {*_ATTENTION, *_CONVOLUTIONS}:
-        raise ValueError(f"target_modules are {targets}")
-    if type(rank) is not int or type(alpha) is not int or rank < 1:
-        raise ValueError(f"r is {rank} and lora_alpha {alpha}")
-    return peft.LoraConfig(
-        r=rank, lora_alpha=alpha, target_modules=list(targets), inference_mode=True
-    )
+def _read_tensors(file: Path, sha256: str, remedy: str) -> dict[str, Tensor]:
+    """A safetensors file, which holds nothing but tensors of the size that the file has."""
+    if not file.is_file():
+        raise InputError(f"{file}: there is no such file; {remedy}")
+    if file_digest(file) != sha256:
+        raise InputError(f"{file}: was changed since it was saved; {remedy}")
+    try:
+        return load_file(file)
+    except (OSError, SafetensorError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
+        raise InputError(f"{file}: cannot be read ({reason}); {remedy}") from None
 
 
-def base_hashes(model: ExtrapolationModel) -> dict[str, str]:
-    """SHA-256 of a model's own weights, whether or not an adapter lies upon them.
+def _require_rank(
+    options: _SavedOptions, weights: Mapping[str, Tensor], file: Path, remedy: str
+) -> None:
+    """InputError unless the tensors have the rank that the options say, before memory of that
+    size is asked for.
+    """
+    ranks = {x.shape[0] for name, x in weights.items() if ".lora_A." in name and x.ndim > 1}
+    if ranks != {options.r} or options.lora_alpha != options.r:
+        found = ", ".join(map(str, sorted(ranks)[:3])) or "no"
+        raise InputError(
+            f"{file}: r is {options.r} and lora_alpha {options.lora_alpha}, but its tensors have "
+            f"rank {found}; {remedy}"
+        )
+
+
+def base_hashes(model: ExtrapolationModel) -> BaseHashes:
+    """SHA-256 of a model's own weights, whether or not an adapter lies on them.
 
     Of the denoiser, and of the networks whose outputs an adapter has learnt to read.
     """
     parts = model.parts()
     others = [parts[name] for name in sorted(parts) if name != "unet"]
-    return {DENOISER: _hash([parts["unet"]]), OTHERS: _hash(others)}
+    return BaseHashes(_hash([parts["unet"]]), _hash(others))
 
 
 def _hash(networks: Iterable[nn.Module]) -> str:

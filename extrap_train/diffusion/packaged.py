@@ -1,5 +1,6 @@
 """The small models that come with the package, by name."""
 
+import json
 from pathlib import Path
 
 from extrap_train.errors import InputError
@@ -22,6 +23,12 @@ def packaged_weights(name: str, option: str = "model.start") -> Path:
 def packaged_names() -> list[str]:
     """All models of the package."""
     return sorted(path.parent.name for path in _FOLDER.glob(f"*/{MODEL_CONFIG}"))
+
+
+def packaged_steps(name: str) -> int | None:
+    """How many steps a packaged model was trained for; None if that is not recorded."""
+    steps: dict[str, int] = json.loads((_FOLDER / "steps.json").read_bytes())
+    return steps.get(name)
 
 
 def packaged_name(family: str, category: str) -> str:

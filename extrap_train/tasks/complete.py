@@ -1,12 +1,11 @@
 """`task=complete`: from a few posed photographs of a scene to a full turn around it."""
 
-import json
-import shutil
 import sys
 import time
 from collections.abc import Iterator
+from collections.abc import Sequence as List
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +18,12 @@ from extrap_train.config import (
     SyntheticConfig,
     TrainConfig,
     dotted,
-    sampler_for,
 )
 from extrap_train.data.photographs import CATEGORY
 from extrap_train.data.scene import SYNTHETIC_SCHEME, open_scene
-from extrap_train.data.sequences import Sequence
+from extrap_train.data.sequences import Frame, Sequence
 from extrap_train.data.synthetic import SyntheticScene, build_scene
 from extrap_train.depth.build import depth_source
-from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.diffusion.memory import advice_where_painting_ends
 from extrap_train.errors import InputError
 from extrap_train.reconstruction.completion import Step, Workshop, complete, map_of_inputs
@@ -41,15 +38,29 @@ from extrap_train.reconstruction.inputs import (
     stand_where,
     world_unit,
 )
-from extrap_train.reconstruction.map_files import load_map, load_steps, save_step, save_view
+from extrap_train.reconstruction.map_files import (
+    load_input_seconds,
+    load_map,
+    load_steps,
+    save_input_seconds,
+    save_view,
+    view_bytes,
+)
 from extrap_train.reconstruction.planner import Query, expected_order, orbit_queries
 from extrap_train.reconstruction.pose_check import check_poses
 from extrap_train.reconstruction.viewer import CloudViewer
-from extrap_train.runs import newest_run
-from extrap_train.store.atomic import file_lock, write_atomic
+from extrap_train.store.cache import claim
 from extrap_train.tasks.completed import Completed, write_completed
-from extrap_train.tasks.scene_folder import require_same, result_folder
-from extrap_train.tasks.scene_inputs import device_of, required_scene, trained_model
+from extrap_train.tasks.scene_content import scene_manifest
+from extrap_train.tasks.scene_folder import require_space, result_folder
+from extrap_train.tasks.scene_inputs import required_scene
+from extrap_train.tasks.scene_model import (
+    UsedWeights,
+    device_of,
+    model_options,
+    scene_generator,
+    trained_model,
+)
 from extrap_train.terminal import progress, terminal
 from extrap_train.views import stack_cameras, stack_poses
 
@@ -76,15 +87,28 @@ class _Job:
     folder: Path
     inputs: list[int]
     unit: WorldUnit
+    used: UsedWeights | None
+    """None where the views are rendered."""
+
+    @property
+    def photographs(self) -> list[Frame]:
+        """The input frames."""
+        return [self.sequence.frames[i] for i in self.inputs]
+
+    @property
+    def weights(self) -> dict[str, str]:
+        """Digests of the weights."""
+        return {} if self.used is None else self.used.inputs()
 
 
 def run(config: TrainConfig) -> Path:
     """Complete a scene; a second run resumes after the last whole view, or says that it is done."""
     job = _job(config)
     console = terminal()
-    job.folder.mkdir(parents=True, exist_ok=True)
-    taken = f"{job.folder}: another process is completing this scene; wait for it or give run=NAME"
-    with file_lock(job.folder / ".lock", taken):
+    manifest = scene_manifest(config, job.photographs, job.weights, _map_options(config))
+    with claim(job.folder, manifest, resume=config.resume) as result:
+        if not result.is_reused:
+            result.begin()
         _run(job, console)
     return job.folder
 
@@ -104,8 +128,9 @@ def _job(config: TrainConfig) -> _Job:
     cameras = [sequence.frames[i].camera for i in inputs]
     check_cameras(cameras, [sequence.frames[i].name for i in inputs])
     _check_category(config, sequence)
-    folder = result_folder(config, _slug(sequence))
-    return _Job(config, sequence, truth, folder, inputs, world_unit(stack_poses(cameras)))
+    folder = result_folder(config, f"{sequence.category}_{sequence.name}")
+    used = UsedWeights.of(config) if _is_painted(config) else None
+    return _Job(config, sequence, truth, folder, inputs, world_unit(stack_poses(cameras)), used)
 
 
 def _check_category(config: TrainConfig, sequence: Sequence) -> None:
@@ -121,30 +146,36 @@ def _check_category(config: TrainConfig, sequence: Sequence) -> None:
     terminal().print(f"the scene is of category {own}, not {chosen}")
 
 
-def _slug(sequence: Sequence) -> str:
-    return f"{sequence.category}_{sequence.name}"
-
-
 def _run(job: _Job, console: Console) -> None:
-    started = time.perf_counter()
     workshop = _workshop(job)
     known = _started_map(job, workshop, console)
-    seconds = {"inputs": time.perf_counter() - started}
     queries = _queries(job, known)
-    order = expected_order(known, queries)
-    draw_plan(known, order, job.folder / "plan.png")
+    # The same plan for a run that resumes.
+    start = replace(known, views=known.views[: len(job.inputs)])
+    order = expected_order(start, queries)
+    draw_plan(start, order, job.folder / "plan.png")
     console.print(_plan_text(known, order))
     if job.config.complete.dry_run:
         console.print(f"plan: {job.folder / 'plan.png'}; nothing was generated")
         return
-    started = time.perf_counter()
+    missing = _count_missing(known, queries)
+    require_space(job.folder, missing * view_bytes(workshop.generator.warp_size))
     with _viewer(job, known, console) as viewer:
         with advice_where_painting_ends(1, job.config.trainer):
             known = _completed(job, known, queries, workshop, viewer)
-        seconds["views"] = time.perf_counter() - started
         steps = load_steps(job.folder / "map", len(known))
+        seconds = {
+            "inputs": load_input_seconds(job.folder / "map"),
+            "views": sum(sum(step.seconds.values()) for step in steps),
+        }
         done = Completed(known, steps, job.unit, job.truth, seconds)
-        write_completed(done, job.config, job.sequence, workshop, job.folder, console)
+        write_completed(done, job.config, job.sequence, workshop, job.used, job.folder, console)
+
+
+def _count_missing(known: GlobalMap, queries: List[Query]) -> int:
+    """How many of the queries the map does not have yet."""
+    there = {view.view.name for view in known.views}
+    return sum(query.name not in there for query in queries)
 
 
 def _workshop(job: _Job) -> Workshop:
@@ -158,8 +189,7 @@ def _workshop(job: _Job) -> Workshop:
             config.complete,
             config.seed,
         )
-    model = trained_model(config).to(device_of(config))
-    generator = DiffusionGenerator(model, sampler_for(config.sampler, model.config))
+    generator = scene_generator(config, trained_model(config).to(device_of(config)))
     # A generated view brings no depth along.
     own = config.depth
     source = StereoConfig() if isinstance(own, DatasetDepthConfig) else own
@@ -169,54 +199,37 @@ def _workshop(job: _Job) -> Workshop:
 def _started_map(job: _Job, workshop: Workshop, console: Console) -> GlobalMap:
     """What an earlier run left, or the inputs, measured and saved."""
     folder = job.folder / "map"
-    if not job.config.resume:
-        shutil.rmtree(folder, ignore_errors=True)
-    _note_options(folder / "options.json", _identity(job, workshop))
     known = load_map(folder, job.config.complete.tolerance)
     if len(known) >= len(job.inputs):
-        console.print(f"{folder}: {len(known)} views are there already")
+        console.print(f"{folder}: {len(known)} views were made before and are used again")
         return known
+    started = time.perf_counter()
+    size = workshop.generator.warp_size
+    require_space(job.folder, len(job.inputs) * view_bytes(size))
     source = depth_source(job.config.depth)
     brought = source.image_size is None
-    photographs = [job.sequence.frames[i].load(depth=brought) for i in job.inputs]
+    photographs = [frame.load(depth=brought) for frame in job.photographs]
     check_poses(photographs)
-    views, confidences = first_views(photographs, source, job.unit, workshop.generator.warp_size)
+    views, confidences = first_views(photographs, source, job.unit, size)
     known = map_of_inputs(views, confidences, job.config.complete.tolerance)
+    save_input_seconds(time.perf_counter() - started, folder)
     for index, view in enumerate(known.views):
-        save_view(view, folder, index)
+        save_view(view, None, folder, index)
     return known
 
 
-def _identity(job: _Job, workshop: Workshop) -> dict[str, Any]:
-    """The options that a map depends on."""
-    config = job.config
+def _map_options(config: TrainConfig) -> dict[str, Any]:
+    """The options of this task that a map depends on."""
     complete_options = {
         f"complete.{key}": value
         for key, value in dotted(asdict(config.complete)).items()
         if not f"{key}.".startswith(tuple(f"{name}." for name in _NOT_PART_OF_THE_MAP))
     }
-    exact = config.complete.generator == "exact"
-    sampler = config.sampler.over(config.model.sampler)
-    if isinstance(workshop.generator, DiffusionGenerator):
-        sampler = workshop.generator.sampler
-    return {
-        "scene": config.scene,
-        "data.seed": getattr(config.data, "seed", None),
-        "inputs": [job.sequence.frames[i].name for i in job.inputs],
-        "depth": asdict(config.depth),
-        **complete_options,
-        "sampler": asdict(sampler),
-        "weights": None if exact else config.weights or str(newest_run(config).model.resolve()),
-        "adapter": config.adapter,
-        "seed": config.seed,
-    }
+    return complete_options | (model_options(config) if _is_painted(config) else {})
 
 
-def _note_options(record: Path, options: dict[str, Any]) -> None:
-    if record.is_file():
-        require_same(record, options, "start over")
-    else:
-        write_atomic(record, (json.dumps(options, indent=1) + "\n").encode())
+def _is_painted(config: TrainConfig) -> bool:
+    return config.complete.generator != "exact"
 
 
 def _queries(job: _Job, known: GlobalMap) -> list[Query]:
@@ -261,13 +274,11 @@ def _completed(
     viewer: CloudViewer | None,
 ) -> GlobalMap:
     folder = job.folder / "map"
-    there = {view.view.name for view in known.views}
-    left = sum(query.name not in there for query in queries)
+    left = _count_missing(known, queries)
     with progress("completing", left, "views") as bar:
 
         def on_step(grown: GlobalMap, added: MapView, step: Step) -> None:
-            save_step(step, folder, len(grown) - 1)
-            save_view(added, folder, len(grown) - 1)
+            save_view(added, step, folder, len(grown) - 1)
             if viewer is not None:
                 viewer.show(grown)
             bar.advance()

@@ -4,7 +4,7 @@ import json
 import time
 from collections.abc import Collection
 from collections.abc import Sequence as List
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,10 +36,13 @@ from extrap_train.reconstruction.report import (
 )
 from extrap_train.runs import provenance
 from extrap_train.store.atomic import write_atomic
-from extrap_train.tasks.scene_inputs import learnt_frames
+from extrap_train.tasks.scene_content import photograph_digests
+from extrap_train.tasks.scene_model import UsedWeights, frames_learnt
 from extrap_train.tasks.splats import write_fitted_splats
 from extrap_train.views import Camera, stack_cameras
 
+_NOTHING_SHARE = 0.02
+"""Of the cloud's points: with fewer, the generated views added next to nothing."""
 SUBDIVIDE = 3
 """Points that a pixel of the cloud becomes along each axis."""
 
@@ -53,7 +56,7 @@ class Completed:
     unit: WorldUnit
     truth: SyntheticScene | None
     seconds: dict[str, float]
-    """Of this session."""
+    """Of the inputs and the views, whichever run made them."""
 
 
 def write_completed(
@@ -61,6 +64,7 @@ def write_completed(
     config: TrainConfig,
     sequence: Sequence,
     workshop: Workshop,
+    used: UsedWeights | None,
     folder: Path,
     console: Console,
 ) -> None:
@@ -85,9 +89,13 @@ def write_completed(
     held_out, missing = _compare_held_out(done, config, sequence, workshop, folder)
     metrics = _metrics(done, cloud)
     done.seconds["measure"] = time.perf_counter() - started
+    given = {view.view.name for view in done.known.views if view.origin.kind == GIVEN}
     summary = {
+        "painted_with": asdict(used) if used else "exact renderings",
+        "photographs": photograph_digests(f for f in sequence.frames if f.name in given),
         "views": {kind: _count(done.known, kind) for kind in (GIVEN, GENERATED)},
         "points": len(cloud),
+        "points_of_generated_views": int((cloud.view >= len(given)).sum()),
         "metrics": metrics,
         "held_out": held_out,
         "splats": splats,
@@ -100,8 +108,37 @@ def write_completed(
         "provenance": provenance(config, {"scene": config.scene or ""}),
     }
     write_atomic(folder / "summary.json", (json.dumps(summary, indent=1) + "\n").encode())
+    console.print(f"painted with {used or 'exact renderings of the scene'}")
+    _print_what_was_added(done, summary, config, console)
     _print(summary, console)
     console.print(f"pictures: {folder / 'growth.png'}\nresult: {folder}")
+
+
+def _print_what_was_added(
+    done: Completed, summary: dict[str, Any], config: TrainConfig, console: Console
+) -> None:
+    """Say where the generated views added next to nothing, and what became of doubtful ones."""
+    confidence = config.complete.confidence
+    doubted = [s.name for s in done.steps if s.agreement < confidence.least_agreement]
+    if doubted:
+        what = (
+            "what they show for the first time was left out of the map"
+            if confidence.reject
+            else "they were kept all the same (complete.confidence.reject=false)"
+        )
+        console.print(
+            f"{len(doubted)} of {len(done.steps)} views contradict the photographs "
+            f"({', '.join(doubted[:3])}{', …' if len(doubted) > 3 else ''}): {what}"
+        )
+    added, points = summary["points_of_generated_views"], summary["points"]
+    if done.steps and added < _NOTHING_SHARE * points:
+        console.print(
+            f"the {len(done.steps)} generated views added next to nothing ({added} of {points} "
+            "points): the photographs show nearly everything already; fewer inputs from one side "
+            "(complete.draw=one_sided inputs=3) leave more to complete"
+        )
+    elif not done.steps:
+        console.print("no view was generated: the photographs already stand all around")
 
 
 def _splats(
@@ -152,7 +189,7 @@ def _compare_held_out(
 ) -> tuple[dict[str, float | None] | None, dict[str, str]]:
     """Views generated at the poses of photographs that were no inputs, against these."""
     given = done.known.views[: _count(done.known, GIVEN)]
-    known = {view.view.name for view in given} | set(learnt_frames(config))
+    known = {view.view.name for view in given} | set(frames_learnt(config, sequence.frames))
     frames = _held_out(given, done.unit, sequence, known)[: config.complete.held_out]
     if not frames or config.complete.generator == "exact":
         return None, {}

@@ -9,7 +9,7 @@ from extrap_train.diffusion.checkpoint import load_model, save_compact
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.packaged import packaged_name, packaged_weights
 from extrap_train.runs import existing_run
-from extrap_train.tasks.scene_inputs import model_of
+from extrap_train.tasks.scene_model import model_of
 from extrap_train.terminal import terminal
 
 _BASE = "base"

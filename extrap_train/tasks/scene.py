@@ -1,10 +1,9 @@
 """`task=scene`: a category model adapted to one scene from its input views alone."""
 
-import hashlib
 import io
 import json
 import math
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,42 +12,58 @@ from lightning.fabric import Fabric
 from rich.console import Console
 
 from data_prep.views import target_views
-from extrap_train.config import SamplerConfig, TrainConfig, dotted, sampler_for
+from extrap_train.config import TrainConfig, dotted, sampler_for
 from extrap_train.data.module import spread
 from extrap_train.data.scene import scene_address
 from extrap_train.data.scene_pairs import AdaptationPairs, adaptation_pairs
-from extrap_train.data.sequences import Sequence
+from extrap_train.data.sequences import Frame, Sequence
 from extrap_train.diffusion.adaptation import Adaptation, adapt
 from extrap_train.diffusion.adapter_card import AdapterOrigin
 from extrap_train.diffusion.evaluation import score_images, summarise
 from extrap_train.diffusion.generator import GeneratedViews
-from extrap_train.diffusion.lora import add_adapter, base_hashes, save_adapter, saved_base_hashes
+from extrap_train.diffusion.lora import (
+    adapter_bytes,
+    add_adapter,
+    read_adapter_record,
+    save_adapter,
+)
 from extrap_train.diffusion.memory import advice_where_adapting_ends
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError
 from extrap_train.metrics import Distance, lpips_or_reason
 from extrap_train.pictures import contact_sheet, curve, error_map, mark_holes
 from extrap_train.store.atomic import write_atomic
+from extrap_train.store.cache import Claim, claim
+from extrap_train.store.digests import file_digest
+from extrap_train.store.records import read_record
 from extrap_train.tasks.results import without_nan
-from extrap_train.tasks.scene_folder import claimed, result_folder, scene_options, whole_result
+from extrap_train.tasks.scene_content import photograph_digests, scene_manifest
+from extrap_train.tasks.scene_folder import nothing_kept, require_space, result_folder
 from extrap_train.tasks.scene_inputs import (
     SceneInputs,
-    device_of,
+    input_frames,
     label_of,
-    named_weights,
     open_inputs,
     open_sequence,
-    painted,
-    painter,
     required_scene,
+)
+from extrap_train.tasks.scene_model import (
+    UsedWeights,
+    device_of,
+    generate_views,
+    model_options,
+    scene_generator,
     trained_model,
 )
 from extrap_train.terminal import progress, terminal
 from extrap_train.views import View, stack_cameras
 
+_PICTURES_BYTES = 2**20
+"""About what tables and pictures take on the disk beside the adapter."""
+
 
 def run(config: TrainConfig) -> Path:
-    """Train an adapter for `minutes` and leave it with its numbers and pictures behind.
+    """Train an adapter for `minutes`; leave it with its numbers and pictures.
 
     What the input views leave over of the scene is held out: the model is measured there with and
     without the adapter. Adapter and numbers appear together, or, interrupted, not at all.
@@ -62,15 +77,21 @@ def run(config: TrainConfig) -> Path:
             "leave it out"
         )
     sequence = open_sequence(config)
-    folder, options = result_folder(config, label_of(sequence)), _options(config)
-    with claimed(folder, options, resume=config.resume):
-        _run(config, sequence, folder, options, console)
+    folder, used = result_folder(config, label_of(sequence)), UsedWeights.of(config)
+    read = _frames_read(config, sequence)
+    options = _options(config) | model_options(config)
+    manifest = scene_manifest(config, read, used.inputs() | _lpips_digest(config), options)
+    with nothing_kept(), claim(folder, manifest, resume=config.resume) as result:
+        if result.is_reused and _is_whole(folder):
+            console.print("already adapted with these options, photographs and weights")
+        else:
+            _run(config, sequence, result, used, console)
     console.print(f"result: {folder}")
     return folder
 
 
 def _run(
-    config: TrainConfig, sequence: Sequence, folder: Path, options: dict[str, Any], console: Console
+    config: TrainConfig, sequence: Sequence, result: Claim, used: UsedWeights, console: Console
 ) -> None:
     distance, missing = lpips_or_reason(config.validation.lpips_weights)
     model = trained_model(config).to(device_of(config))
@@ -80,16 +101,14 @@ def _run(
     )
     sampler = sampler_for(config.sampler, model.config)
     targets = _targets(config, inputs, model)
-    asked = options | _content(model, inputs.views, targets, sampler)
-    if config.resume and _is_done(folder, asked):
-        console.print("already adapted with these options")
-        return
     before = _generate(model, config, inputs, targets)
     if config.trainer.gradient_checkpointing:
         model.unet.enable_gradient_checkpointing()
     adapter = add_adapter(model, config.lora, config.seed)
+    require_space(result.folder, adapter_bytes(adapter) + _PICTURES_BYTES)
     advice = advice_where_adapting_ends(config.lora, config.trainer)
     with progress("adapting", 100, "%") as bar, advice:
+        bar.reach(0, "measuring the base")
 
         def on_step(step: int, share: float) -> None:
             bar.reach(round(100 * min(share, 1.0)), f"step {step}")
@@ -106,11 +125,27 @@ def _run(
             on_step=on_step,
         )
     after = _generate(model, config, inputs, targets)
-    with whole_result(folder, options) as whole:
-        save_adapter(model, adapter, whole / "adapter", _origin(config, inputs, done))
+    origin = _origin(config, sequence, inputs, used, done)
+    with result.replace() as whole:
+        save_adapter(model, adapter, whole / "adapter", origin)
         measured = _measure(before, after, targets, whole, distance)
-        _write(whole, asked, done, pairs, measured, missing)
-    console.print(_said(done, measured))
+        read = [view.name for view in inputs.views], [view.name for view in targets]
+        _write(whole, read, used, done, pairs, measured, missing)
+    console.print(f"adapted {used}: {_describe(done, measured)}")
+
+
+def _frames_read(config: TrainConfig, sequence: Sequence) -> list[Frame]:
+    """The input frames and those that the adapter is measured on."""
+    part, chosen = input_frames(config, sequence)
+    inputs = [part.frames[i] for i in chosen]
+    names = {frame.name for frame in inputs}
+    others = [frame for frame in sequence.frames if frame.name not in names]
+    return inputs + [others[i] for i in spread(len(others), config.validation.examples)]
+
+
+def _lpips_digest(config: TrainConfig) -> dict[str, str]:
+    path = config.validation.lpips_weights
+    return {} if path is None else {"weights of LPIPS": file_digest(Path(path))}
 
 
 def _fabric(config: TrainConfig) -> Fabric:
@@ -127,52 +162,43 @@ def _options(config: TrainConfig) -> dict[str, Any]:
         "validation.examples": config.validation.examples,
         "validation.lpips_weights": config.validation.lpips_weights,
     }
-    return scene_options(config) | dotted(adapting)
+    return dotted(adapting)
 
 
-def _origin(config: TrainConfig, inputs: SceneInputs, done: Adaptation) -> AdapterOrigin:
+def _origin(
+    config: TrainConfig,
+    sequence: Sequence,
+    inputs: SceneInputs,
+    used: UsedWeights,
+    done: Adaptation,
+) -> AdapterOrigin:
     options = {"lora": asdict(config.lora), "minutes": config.minutes, "seed": config.seed}
+    learnt = {view.name for view in inputs.views}
     return AdapterOrigin(
         scene=scene_address(required_scene(config)),
-        inputs=[view.name for view in inputs.views],
-        weights=named_weights(config),
+        photographs=photograph_digests(f for f in sequence.frames if f.name in learnt),
+        weights=used.name,
         options=dotted(options),
-        outcome=_outcome(done),
+        outcome=_describe_end(done),
     )
 
 
-def _content(
-    model: ExtrapolationModel, views: list[View], targets: list[View], sampler: SamplerConfig
-) -> dict[str, Any]:
-    """What the result follows from beside the options: weights and views by what is in them."""
-    return {
-        "inputs": [view.name for view in views],
-        "held_out": [view.name for view in targets],
-        "views": _digest(views + targets),
-        "model": asdict(model.config),
-        "base": base_hashes(model),
-        "sampler": asdict(sampler),
-    }
+@dataclass(frozen=True)
+class _Finished:
+    """Of the summary, what a whole result must say."""
+
+    adaptation: Adaptation
 
 
-def _digest(views: list[View]) -> str:
-    digest = hashlib.sha256()
-    for view in views:
-        tensors = (view.image, view.depth, view.camera.world_to_cam, view.camera.intrinsics)
-        for tensor in tensors:
-            if tensor is not None:
-                digest.update(tensor.cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()
-
-
-def _is_done(folder: Path, asked: dict[str, Any]) -> bool:
-    """Whether the adapter lies there that was made of this, with its numbers beside it."""
+def _is_whole(folder: Path) -> bool:
+    """Whether the adapter lies there with its numbers, neither of them damaged."""
     try:
-        found = json.loads((folder / "summary.json").read_text())["asked"]
-    except (OSError, ValueError, KeyError, TypeError):
+        read_record(folder / "summary.json", _Finished, "")
+        read_adapter_record(folder / "adapter")
+    except InputError as error:
+        terminal(stderr=True).print(f"{error}: adapting again")
         return False
-    same = found == json.loads(json.dumps(asked))
-    return same and saved_base_hashes(folder / "adapter") == asked["base"]
+    return True
 
 
 def _targets(config: TrainConfig, inputs: SceneInputs, model: ExtrapolationModel) -> list[View]:
@@ -189,7 +215,7 @@ def _generate(
     if not targets:
         return None
     cameras, names = stack_cameras([v.camera for v in targets]), [v.name for v in targets]
-    return painted(painter(config, model), inputs.views, cameras, names, config)
+    return generate_views(scene_generator(config, model), inputs.views, cameras, names, config)
 
 
 def _measure(
@@ -223,7 +249,8 @@ def _measure(
 
 def _write(
     folder: Path,
-    asked: dict[str, Any],
+    read: tuple[list[str], list[str]],
+    used: UsedWeights,
     done: Adaptation,
     pairs: AdaptationPairs,
     measured: dict[str, dict[str, float]],
@@ -232,7 +259,9 @@ def _write(
     steps, losses = [list(column) for column in zip(*done.losses, strict=True)]
     curve(steps, {"held-out pair": losses}, "denoising error", folder / "curve.png")
     summary = {
-        "asked": asked,
+        "painted_with": asdict(used),
+        "inputs": read[0],
+        "held_out_frames": read[1],
         "pairs": pairs.counts(),
         "adaptation": asdict(done),
         "held_out": measured,
@@ -242,8 +271,8 @@ def _write(
     write_atomic(folder / "summary.json", content.encode())
 
 
-def _said(done: Adaptation, measured: dict[str, dict[str, float]]) -> str:
-    text = _outcome(done)
+def _describe(done: Adaptation, measured: dict[str, dict[str, float]]) -> str:
+    text = _describe_end(done)
     if measured:
         one, other = measured["model"], measured["adapted"]
         text += f"; held-out views: PSNR {one['psnr']:.2f} → {other['psnr']:.2f} dB"
@@ -252,6 +281,10 @@ def _said(done: Adaptation, measured: dict[str, dict[str, float]]) -> str:
     return text
 
 
-def _outcome(done: Adaptation) -> str:
+def _describe_end(done: Adaptation) -> str:
+    if not done.steps:
+        return (
+            f"the time was up after {done.seconds:.0f} s, before the first step: give more minutes="
+        )
     kept = f"kept step {done.best_step} of {done.steps}" if done.best_step else "kept the base"
     return f"ended by {done.ended} after {done.seconds:.0f} s, {kept}"

@@ -1,4 +1,4 @@
-"""`task=view`: the picture from a pose, or a walk around the scene, with the warp beside it.
+"""`task=view`: the picture from a pose, or a walk around the scene, and the warp it came from.
 
 The same in Python: `open_generator`, `open_views`, `walk`.
 """
@@ -31,18 +31,25 @@ from extrap_train.errors import InputError, did_you_mean
 from extrap_train.geometry.orbits import LEAST_VIEWS, orbit_cameras
 from extrap_train.metrics import psnr, quantised
 from extrap_train.pictures import contact_sheet, film, mark_holes, picture, picture_names
-from extrap_train.tasks.scene_folder import claimed, result_folder, scene_options, whole_result
+from extrap_train.store.cache import claim
+from extrap_train.store.records import write_record
+from extrap_train.tasks.scene_content import photograph_digests, scene_manifest
+from extrap_train.tasks.scene_folder import nothing_kept, require_space, result_folder
 from extrap_train.tasks.scene_inputs import (
     SceneInputs,
-    device_of,
     input_frames,
     label_of,
-    learnt_frames,
     open_inputs,
-    open_model,
     open_sequence,
-    painted,
-    painter,
+)
+from extrap_train.tasks.scene_model import (
+    UsedWeights,
+    device_of,
+    frames_learnt,
+    generate_views,
+    model_options,
+    open_model,
+    scene_generator,
     trained_model,
 )
 from extrap_train.terminal import terminal
@@ -50,6 +57,8 @@ from extrap_train.views import Camera, View, stack_cameras
 
 _UNSEEN_SHARE = 0.02
 """Of a view that the inputs show: with less it is as good as turned away."""
+_PICTURES_PER_VIEW = 8
+"""View and warp, in files of their own, in both films and on the sheet."""
 
 
 @dataclass(frozen=True)
@@ -63,34 +72,62 @@ class _Query:
     """Of a frame that is asked for, as it was taken."""
 
 
+@dataclass(frozen=True)
+class _Summary:
+    """`summary.json` of a view: what it shows, and from what it was made."""
+
+    painted_with: UsedWeights
+    photographs: dict[str, str]
+    """SHA-256 of the content of the inputs, by the frames' names."""
+    shown: dict[str, float]
+    """Share of each view that the inputs show."""
+    psnr: float | None
+    """In dB against the photograph; None where there is none to compare with."""
+
+
 def run(config: TrainConfig) -> None:
     """Paint the views that `pose` or `orbit` ask for, and leave them as PNG, GIF and MP4.
 
-    They take the place of what was asked of the same scene, inputs and weights before.
+    They replace what was asked of the same scene, inputs and weights before.
     """
     console = terminal()
     sequence = open_sequence(config)
     query = _query(config, sequence)
-    folder, options = result_folder(config, label_of(sequence)), scene_options(config)
-    with claimed(folder, options, resume=config.resume):
+    folder, used = result_folder(config, label_of(sequence)), UsedWeights.of(config)
+    # Which frames are inputs depends on the pose, so all of the capture count.
+    manifest = scene_manifest(config, sequence.frames, used.inputs(), model_options(config))
+    with nothing_kept(), claim(folder, manifest, resume=config.resume) as result:
         model = trained_model(config).to(device_of(config))
+        size = model.config.image_size
+        require_space(folder, len(query.names) * _PICTURES_PER_VIEW * 3 * size**2)
         inputs = open_inputs(config, sequence, model.config.warp_size, config.pose)
-        cameras, truth = _cameras(query, inputs.views, config, model.config.image_size)
-        generator = painter(config, model)
-        made = painted(generator, inputs.views, cameras, query.names, config)
-        _say_shares(made, query.names, console)
-        with whole_result(folder, options) as whole:  # nothing of another pose's stays in it
+        cameras, truth = _cameras(query, inputs.views, config, size)
+        generator = scene_generator(config, model)
+        made = generate_views(generator, inputs.views, cameras, query.names, config)
+        console.print(f"painted with {used}")
+        _print_shares(made, query.names, console)
+        score, why_not = _compare(made, truth, inputs, config, sequence)
+        with result.replace() as whole:
             _write(made, inputs.views, query.names, whole, walk=config.orbit is not None)
             if truth is not None:
                 picture(truth.image, whole / "truth.png")
+            names = {view.name for view in inputs.views}
+            read = photograph_digests(f for f in sequence.frames if f.name in names)
+            shown = dict(zip(query.names, _shares(made), strict=True))
+            write_record(whole / "summary.json", _Summary(used, read, shown, score))
     if truth is not None:
-        console.print(_compared(made, truth, inputs, config))
+        console.print(why_not or f"PSNR against the photograph: {score:.2f} dB")
     console.print(f"result: {folder}")
 
 
-def _say_shares(made: GeneratedViews, names: list[str], console: Console) -> None:
+def _shares(made: GeneratedViews) -> list[float]:
+    """How much of each view the inputs show."""
+    return made.warp.mask.flatten(1).mean(1).tolist()
+
+
+def _print_shares(made: GeneratedViews, names: list[str], console: Console) -> None:
     """How much of each view the inputs show, which is what the picture can be trusted for."""
-    shares = made.warp.mask.flatten(1).mean(1).tolist()
+    shares = _shares(made)
     least, most = (f"{100 * share:.0f}" for share in (min(shares), max(shares)))
     which = names[0] if len(names) == 1 else "the views"
     span = least if least == most else f"{least} to {most}"
@@ -105,13 +142,21 @@ def _say_shares(made: GeneratedViews, names: list[str], console: Console) -> Non
         )
 
 
-def _compared(made: GeneratedViews, truth: View, inputs: SceneInputs, config: TrainConfig) -> str:
+def _compare(
+    made: GeneratedViews,
+    truth: View | None,
+    inputs: SceneInputs,
+    config: TrainConfig,
+    sequence: Sequence,
+) -> tuple[float | None, str]:
+    """PSNR in dB against the photograph, or why there is none."""
+    if truth is None:
+        return None, ""
     if truth.name in {view.name for view in inputs.views}:
-        return f"no PSNR: {truth.name} is an input itself; leave it out of input_frames"
-    if truth.name in learnt_frames(config):
-        return f"no PSNR: the adapter was trained on {truth.name}"
-    found = float(psnr(quantised(made.images), quantised(truth.image[None])))
-    return f"PSNR against the photograph: {found:.2f} dB"
+        return None, f"no PSNR: {truth.name} is an input itself; leave it out of input_frames"
+    if frames_learnt(config, [f for f in sequence.frames if f.name == truth.name]):
+        return None, f"no PSNR: the adapter was trained on {truth.name}"
+    return float(psnr(quantised(made.images), quantised(truth.image[None]))), ""
 
 
 def open_generator(

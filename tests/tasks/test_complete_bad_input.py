@@ -71,7 +71,7 @@ def refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Command:
         message = str(stopped.value)
         assert message.startswith("error: ")
         assert "\n" not in message
-        assert not list((tmp_path / "out").rglob("*.npz"))
+        assert not list((tmp_path / "out").rglob("*.safetensors"))
         return message
 
     return run

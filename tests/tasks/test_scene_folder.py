@@ -5,9 +5,11 @@ import shutil
 from pathlib import Path
 
 import pytest
+import torch
 from captures import write_capture
 from filelock import FileLock
 
+from extrap_train.diffusion.checkpoint import load_model, save_model
 from extrap_train.tasks import scene
 
 _SHORT = ["minutes=0.2", "lora.steps=2", "lora.validate_every=2", "lora.batch_size=2"]
@@ -43,7 +45,7 @@ def test_other_options_do_not_overwrite_an_adapter(command, refused, weights, tm
     base = ["task=scene", f"weights={weights}", *_SHORT, "lora.rank=3"]
     command(*base)
     said = refused(*base, "lora.rank=2", "inputs=3")
-    assert "scene/hydrant-0000: was made with other options: " in said
+    assert "scene/hydrant-0000: made with different " in said
     assert "inputs (was 4, now 3)" in said
     assert "lora.rank (was 3, now 2)" in said
     assert "run=NAME" in said
@@ -74,23 +76,30 @@ def test_two_scenes_of_one_name_do_not_overwrite_each_other(
     assert (tmp_path / "view" / "cup-one" / "views" / "frame000011.png").is_file()
 
 
-def test_another_pose_is_painted_anew_but_other_weights_elsewhere(
+def test_another_pose_replaces_a_view_but_other_weights_do_not(
     command, refused, weights, tmp_path
 ) -> None:
-    copy = shutil.copytree(weights, tmp_path / "other")
+    """The same weights elsewhere are the same weights; others at the same place are not."""
+    copy = Path(shutil.copytree(weights, tmp_path / "other"))
     command("task=view", f"weights={weights}", "pose=frame000003")
-    command("task=view", f"weights={weights}", "pose=frame000005")
+    command("task=view", f"weights={copy}", "pose=frame000005")
+    model = load_model(copy)
+    torch.nn.init.normal_(model.unet.conv_out.weight, std=0.06)
+    save_model(model, copy)
     said = refused("task=view", f"weights={copy}", "pose=frame000005")
-    assert f"weights (was {weights}, now {copy})" in said
+    assert "view/hydrant-0000: made with different weights (other content)" in said
+    command("task=view", f"weights={copy}", "pose=frame000005", "resume=false")
 
 
 def test_a_folder_that_says_not_what_it_is_of_is_left_alone(refused, weights, tmp_path) -> None:
-    mine = tmp_path / "view" / "mine"
-    mine.mkdir(parents=True)
-    (mine / "thesis.txt").write_text("years of work")
-    said = refused("task=view", f"weights={weights}", "pose=frame000003", "run=mine")
-    assert "there is no made_with.json that says what it was made with" in said
-    assert (mine / "thesis.txt").is_file()
+    for task in (["task=view", "pose=frame000003"], ["task=scene", *_SHORT], ["task=complete"]):
+        mine = tmp_path / task[0].removeprefix("task=") / "mine"
+        mine.mkdir(parents=True)
+        (mine / "thesis.txt").write_text("years of work")
+        said = refused(*task, f"weights={weights}", "run=mine")
+        assert "mine/manifest.json: cannot be read" in said
+        assert "run=NAME" in said
+        assert [path.name for path in mine.iterdir()] == ["thesis.txt"]
 
 
 @pytest.mark.parametrize("task", [["task=scene", *_SHORT], ["task=view", "pose=frame000003"]])
@@ -99,7 +108,7 @@ def test_two_at_once_do_not_write_the_same_folder(refused, weights, tmp_path, ta
     lock.parent.mkdir()
     with FileLock(lock):
         said = refused(*task, f"weights={weights}")
-    assert "another process is making this; wait for it or give run=NAME" in said
+    assert "another process is writing this result; wait for it or give run=NAME" in said
 
 
 def test_what_is_asked_for_is_checked_before_depth_is_estimated(

@@ -12,12 +12,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from extrap_train.config import LoraConfig
+from extrap_train.config import LoraConfig, SyntheticConfig
+from extrap_train.data.scene import open_scene
 from extrap_train.diffusion.adapter_card import AdapterOrigin
 from extrap_train.diffusion.checkpoint import load_model, save_model
 from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.diffusion.lora import add_adapter, save_adapter
 from extrap_train.pictures import picture_names
+from extrap_train.tasks.scene_content import frame_digest
 from extrap_train.tasks.view import open_generator, open_views, walk
 
 
@@ -135,7 +137,8 @@ def test_pictures_of_all_names_lie_beside_each_other_and_nothing_else_does(
     names = ["left/0001.png", "right/0001.png", "img.1", "img.2", "./a", "a_warp", "A", "a"]
     poses = _poses(tmp_path / "poses.json", 4.0, *names)
     command("task=view", f"weights={weights}", f"pose={poses}")
-    assert {path.name for path in folder.iterdir()} == {"views", "sheet.png", "made_with.json"}
+    there = {path.name for path in folder.iterdir()}
+    assert there == {"views", "sheet.png", "manifest.json", "summary.json"}
     assert len(list((folder / "views").iterdir())) == 2 * len(names)
     assert (folder / "views" / "left_0001.png").is_file()
     assert (folder / "views" / "img.2_warp.png").is_file()
@@ -168,9 +171,7 @@ def test_an_adapter_is_made_used_again_and_put_upon_the_weights(
     command("task=scene", f"weights={weights}", *options)
     assert "already adapted with these options" in capsys.readouterr().out
     view = ["task=view", f"weights={weights}", f"adapter={folder / 'adapter'}"]
-    learnt, other = (
-        names[0] for names in (summary["asked"]["inputs"], summary["asked"]["held_out"])
-    )
+    learnt, other = (names[0] for names in (summary["inputs"], summary["held_out_frames"]))
     command(*view, f"pose={other}")
     said = capsys.readouterr()
     assert "PSNR against the photograph" in said.out
@@ -183,37 +184,45 @@ def test_an_adapter_is_made_used_again_and_put_upon_the_weights(
     assert "PSNR against the photograph" in said.out
 
 
-def test_an_adapter_is_made_anew_for_other_weights_of_the_same_name(
-    command, weights, tmp_path, capsys
+def test_a_damaged_adapter_is_made_again_and_one_of_other_weights_is_kept(
+    command, refused, weights, tmp_path, capsys
 ) -> None:
-    """As after a longer training; or where the adapter is gone, or its summary cannot be read."""
+    """Weights of the same name that were trained for longer are other weights."""
     folder, model = tmp_path / "scene" / "hydrant-0000", tmp_path / "model"
     shutil.copytree(weights, model)
     options = ["minutes=0.2", "lora.steps=2", "lora.validate_every=2", "lora.batch_size=2"]
+    asked = ["task=scene", f"weights={model}", *options]
 
     def is_made() -> bool:
         capsys.readouterr()
-        command("task=scene", f"weights={model}", *options)
+        command(*asked)
         return "already adapted" not in capsys.readouterr().out
 
     assert is_made()
     assert not is_made()
+    shutil.rmtree(folder / "adapter")
+    assert is_made()
+    for damage in ('{"asked"', "[" * 100_000, '{"adaptation": {"steps": "many"}}'):
+        (folder / "summary.json").write_text(damage)
+        assert is_made()
     trained_on = load_model(model)
     torch.nn.init.normal_(trained_on.unet.conv_out.weight, std=0.05)
     save_model(trained_on, model)
-    assert is_made()
-    command("task=view", f"weights={model}", f"adapter={folder / 'adapter'}", "pose=frame000003")
-    shutil.rmtree(folder / "adapter")
-    assert is_made()
-    (folder / "summary.json").write_text('{"asked"')
-    assert is_made()
+    assert "made with different weights (other content)" in refused(*asked)
+    assert "was trained on other weights" in refused(
+        "task=view", f"weights={model}", f"adapter={folder / 'adapter'}", "pose=frame000003"
+    )
 
 
 def test_before_a_run_the_category_s_packaged_model_paints_and_says_so(
     command, tmp_path, capsys
 ) -> None:
     command("task=view", "pose=frame000003")
-    assert "weights=ours-hydrant, of the package" in " ".join(capsys.readouterr().err.split())
+    assert "painted with ours-hydrant (packaged, 1,200 steps)" in capsys.readouterr().out
+    summary = json.loads((tmp_path / "view" / "hydrant-0000" / "summary.json").read_text())
+    assert summary["painted_with"]["name"] == "ours-hydrant"
+    assert len(summary["painted_with"]["sha256"]) == 64
+    assert len(summary["photographs"]) == 4
     assert Image.open(tmp_path / "view" / "hydrant-0000" / "truth.png").size == (64, 64)
 
 
@@ -246,7 +255,10 @@ def _adapter_of(weights: Path, folder: Path, *frames: str) -> Path:
     """An adapter without effect that says it was trained on these."""
     model = load_model(weights)
     adapter = add_adapter(model, LoraConfig(rank=1), seed=0)
-    origin = AdapterOrigin("synthetic:hydrant/0000", list(frames), str(weights), {}, "")
+    options = SyntheticConfig(frames=8, image_size=32)
+    known = {frame.name: frame for frame in open_scene("synthetic:hydrant/0000", options).frames}
+    learnt = {name: frame_digest(known[name]) for name in frames}
+    origin = AdapterOrigin("synthetic:hydrant/0000", learnt, str(weights), {}, "")
     save_adapter(model, adapter, folder, origin)
     return folder
 

@@ -1,0 +1,222 @@
+"""The model that a task about one scene paints with: weights, adapter and generator."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.fabric import Fabric
+
+from extrap_train.config import ModelConfig, TrainConfig, dotted, sampler_for
+from extrap_train.data.scene import scene_address
+from extrap_train.data.sequences import Frame
+from extrap_train.device import require_accelerator
+from extrap_train.diffusion.checkpoint import is_own, load_model, published_model, saved_config
+from extrap_train.diffusion.generator import DiffusionGenerator, GeneratedViews
+from extrap_train.diffusion.layout import arranged
+from extrap_train.diffusion.lora import load_adapter, read_adapter_record
+from extrap_train.diffusion.memory import advice_where_painting_ends
+from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.packaged import (
+    packaged_name,
+    packaged_names,
+    packaged_steps,
+    packaged_weights,
+)
+from extrap_train.errors import InputError
+from extrap_train.runs import RunFolder, newest_run
+from extrap_train.store.digests import file_digest, folder_digest
+from extrap_train.store.records import read_record
+from extrap_train.tasks.saved_model import require_as_said, require_described
+from extrap_train.tasks.scene_content import frame_digest
+from extrap_train.tasks.scene_inputs import required_scene
+from extrap_train.terminal import terminal
+from extrap_train.views import Camera, View
+
+
+@dataclass(frozen=True)
+class _TrainedSteps:
+    steps: int
+
+
+@dataclass(frozen=True)
+class UsedWeights:
+    """Which weights a result was painted with."""
+
+    name: str
+    """A packaged model's, or an absolute path."""
+    sha256: str
+    is_packaged: bool
+    steps: int | None
+    """That they were trained for; None if that is not known, as of published weights."""
+    adapter: str | None
+    adapter_sha256: str | None
+
+    @classmethod
+    def of(cls, config: TrainConfig) -> "UsedWeights":
+        """The weights and the adapter that the options name; InputError if there are none."""
+        name = named_weights(config)
+        path, adapter = Path(name), config.adapter and Path(config.adapter)
+        if adapter and not adapter.is_dir():
+            raise InputError(f"adapter={adapter}: no such folder; give an adapter of task=scene")
+        return cls(
+            name=name,
+            sha256=_content_digest(_folder_of(name)),
+            is_packaged=not path.exists(),
+            steps=_steps_of(path) if path.exists() else packaged_steps(name),
+            adapter=str(adapter.resolve()) if adapter else None,
+            adapter_sha256=folder_digest(adapter) if adapter else None,
+        )
+
+    def __str__(self) -> str:
+        about = ["packaged"] if self.is_packaged else []
+        about += [] if self.steps is None else [f"{self.steps:,} steps"]
+        described = f" ({', '.join(about)})" if about else ""
+        return f"{self.name}{described}{f', adapter {self.adapter}' if self.adapter else ''}"
+
+    def inputs(self) -> dict[str, str]:
+        """Their digests, as a manifest lists what it was made from."""
+        found = {"weights": self.sha256}
+        return found if self.adapter_sha256 is None else {**found, "adapter": self.adapter_sha256}
+
+
+def model_options(config: TrainConfig) -> dict[str, Any]:
+    """The options that say how published weights are read; a saved model says so itself."""
+    if is_own(_folder_of(named_weights(config))):
+        return {}
+    return dotted({"model": asdict(config.model)})
+
+
+def _content_digest(weights: Path) -> str:
+    return folder_digest(weights) if weights.is_dir() else file_digest(weights)
+
+
+def _steps_of(model: Path) -> int | None:
+    """Of a run's model, from the run's summary."""
+    summary = RunFolder(model.parent).summary
+    if model.name != "model" or not summary.is_file():
+        return None
+    return read_record(summary, _TrainedSteps, "train the run again (task=category)").steps
+
+
+def trained_model(config: TrainConfig) -> ExtrapolationModel:
+    """The model that `weights` names, with its adapter if any; by default the category's newest.
+
+    Before there is a run, it is the packaged model of the category. Prints a warning if the
+    adapter was made for another scene.
+    """
+    _warn_of_another_scene(config)
+    return model_of(config, named_weights(config))
+
+
+def model_of(config: TrainConfig, weights: str) -> ExtrapolationModel:
+    """The model that a command uses: as it was saved, or a published one, as `model` describes it.
+
+    Raises InputError for an option of the command line that a saved model contradicts.
+    """
+    folder = _folder_of(weights)
+    if not is_own(folder):
+        return open_model(weights, config.adapter, config.model)
+    require_as_said(saved_config(folder), config.model, folder)
+    return open_model(weights, config.adapter)
+
+
+def frames_learnt(config: TrainConfig, frames: Iterable[Frame]) -> list[str]:
+    """Those of the frames whose content the adapter was trained on; none without an adapter."""
+    if config.adapter is None:
+        return []
+    learnt = set(read_adapter_record(Path(config.adapter)).photographs.values())
+    return [frame.name for frame in frames if frame_digest(frame) in learnt]
+
+
+def _warn_of_another_scene(config: TrainConfig) -> None:
+    if config.adapter is None:
+        return
+    origin, here = read_adapter_record(Path(config.adapter)), scene_address(required_scene(config))
+    if origin.scene != here:
+        terminal(stderr=True).print(
+            f"adapter={config.adapter}: was made for {origin.scene}, not for {here}; the model "
+            "without it may paint this scene better"
+        )
+
+
+def named_weights(config: TrainConfig) -> str:
+    """What `weights` names, or what takes its place: an absolute path, or a packaged model's name.
+
+    Raises InputError where nothing does.
+    """
+    path = newest_run(config).model if config.weights is None else Path(config.weights)
+    if path.exists():
+        return str(path.resolve())
+    return config.weights or _packaged(config)
+
+
+def _packaged(config: TrainConfig) -> str:
+    """The packaged model of this configuration; InputError where there is none."""
+    name = packaged_name(config.model.family, config.category.name)
+    if config.model.name.startswith("small") and name in packaged_names():
+        return name
+    raise InputError(
+        f"{newest_run(config).model}: there is no trained model of {config.category.name}; train "
+        "one (task=category), or give weights=FOLDER or a packaged model's name: "
+        f"{', '.join(packaged_names())}"
+    )
+
+
+def open_model(
+    weights: str, adapter: str | None = None, config: ModelConfig | None = None
+) -> ExtrapolationModel:
+    """The model of a folder, of the package or of a published checkpoint, with a scene's adapter
+    applied if any.
+
+    A published checkpoint does not say what it is: it is read as the model that `config` describes.
+    InputError where that is another than the saved one.
+    """
+    path = _folder_of(weights)
+    if is_own(path):
+        if config is not None:
+            require_described(saved_config(path), config, path)
+        model = load_model(path)
+    elif config is not None:
+        model = published_model(weights, config)
+    else:
+        raise InputError(
+            f"weights={weights}: is no model folder of this project; a published checkpoint needs "
+            "the configuration of its model as well"
+        )
+    if adapter is not None:
+        load_adapter(model, Path(adapter))
+    return arranged(model).eval()
+
+
+def _folder_of(weights: str) -> Path:
+    """What `weights` names: a path, or the folder of a packaged model."""
+    path = Path(weights)
+    return path if path.exists() else packaged_weights(weights, "weights")
+
+
+def device_of(config: TrainConfig) -> torch.device:
+    """Where the network runs; InputError where there is no such device."""
+    require_accelerator(config.trainer.accelerator)
+    return Fabric(accelerator=config.trainer.accelerator, devices=1).device
+
+
+def scene_generator(config: TrainConfig, model: ExtrapolationModel) -> DiffusionGenerator:
+    """The generator of every task about a scene: sampler and precision as the options say."""
+    sampler = sampler_for(config.sampler, model.config)
+    return DiffusionGenerator(
+        model, sampler, config.painted_at_once, precision=config.trainer.precision
+    )
+
+
+def generate_views(
+    generator: DiffusionGenerator,
+    views: Sequence[View],
+    cameras: Camera,
+    names: Sequence[str],
+    config: TrainConfig,
+) -> GeneratedViews:
+    """The generator's views; InputError that says which option to change where memory ends."""
+    with advice_where_painting_ends(config.painted_at_once, config.trainer):
+        return generator.generate(views, cameras, names, config.seed)
