@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from data_prep.frames import too_many_unusable
 from extrap_train.config import PrepConfig
+from extrap_train.data.camera_check import CO3D_POSES, find_pose_fault
 from extrap_train.data.sequences import Sequence
 from extrap_train.data.validation import is_degenerate
 from extrap_train.geometry.viewpoints import facing, fit_orbit, scene_center
@@ -71,6 +72,8 @@ def judge(sequence: Sequence, options: PrepConfig) -> Verdict:
         return Verdict(
             False, f"degenerate camera (NaN, no rotation, no focal length): {name}", count
         )
+    if fault := find_pose_fault(cameras, CO3D_POSES):
+        return Verdict(False, fault, count)
     facing_share = float(facing(cameras, scene_center(cameras), _FACING_RAD).mean())
     gap, coverage = azimuth_coverage(cameras)
     reasons = _quality_reasons(sequence, options)

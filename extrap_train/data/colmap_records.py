@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from extrap_train.data.picture_files import MAX_PIXELS
 from extrap_train.errors import InputError
 from extrap_train.geometry.colmap import CAMERA_MODELS, OTHER_MODELS, lens_from_parameters
 from extrap_train.geometry.lens import Lens
@@ -38,7 +39,8 @@ class ModelCamera:
                 "image_undistorter first"
             )
         count = len(self.parameters)
-        if count != len(model.parameters) or self.height <= 0 or self.width <= 0:
+        sized = self.height > 0 and self.width > 0 and self.height * self.width <= MAX_PIXELS
+        if count != len(model.parameters) or not sized:
             raise InputError(
                 f"{file}: camera {self.number} ({model.name}) has {count} parameters and size "
                 f"{self.height} x {self.width}, expected {len(model.parameters)} of them; export "

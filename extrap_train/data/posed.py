@@ -19,7 +19,7 @@ from extrap_train.data.photographs import (
     pinhole_camera,
     sequence_of_photographs,
 )
-from extrap_train.data.picture_files import image_size
+from extrap_train.data.picture_files import MAX_PIXELS, image_size
 from extrap_train.data.sequences import PointCloud, Sequence
 from extrap_train.data.validation import require_dict, require_list
 from extrap_train.errors import InputError
@@ -132,7 +132,7 @@ def _size(picture: Path, entry: dict[str, Any]) -> tuple[int, int]:
     if "h" not in entry and "w" not in entry:
         return image_size(picture)
     height, width = int(entry["h"]), int(entry["w"])
-    if height <= 0 or width <= 0:
+    if height <= 0 or width <= 0 or height * width > MAX_PIXELS:
         raise ValueError(f"image size {height} x {width}")
     return height, width
 

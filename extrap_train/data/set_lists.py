@@ -67,7 +67,7 @@ def read_set_list(root: Path, category: str, name: str) -> dict[str, list[FrameI
             ]
             for subset, entries in content.items()
         }
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(

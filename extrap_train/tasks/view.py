@@ -92,6 +92,7 @@ def run(config: TrainConfig) -> None:
     """
     console = terminal()
     sequence = open_sequence(config)
+    config = replace(config, pose=_as_named(config.pose, sequence))
     query = _query(config, sequence)
     folder, used = result_folder(config, label_of(sequence)), UsedWeights.of(config)
     # Which frames are inputs depends on the pose, so all of the capture count.
@@ -210,6 +211,13 @@ def _require_orbit(views: int) -> None:
 
 def _places(frames: int) -> list[str]:
     return [f"{index:03d}" for index in range(frames)]
+
+
+def _as_named(pose: str | None, sequence: Sequence) -> str | None:
+    """The frame that `pose` names, in the case in which the scene has it."""
+    names = [frame.name for frame in sequence.frames if pose is not None]
+    alike = [name for name in names if name.casefold() == str(pose).casefold()]
+    return alike[0] if len(alike) == 1 else pose
 
 
 def _query(config: TrainConfig, sequence: Sequence) -> _Query:
