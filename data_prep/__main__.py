@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from extrap_train.cli import command
+from extrap_train.cli import PREP, command
 from extrap_train.config import DataPrepConfig
 
 
@@ -20,7 +20,7 @@ def _run(config: DataPrepConfig) -> None:
             config.depth,
             config.prep,
             output=Path(config.output),
-            workers=config.workers,
+            workers=config.workers or config.threads,
             matcher=config.matcher,
             launcher=config.launcher,
             retry=True,
@@ -30,7 +30,7 @@ def _run(config: DataPrepConfig) -> None:
 
 def main() -> None:
     """Entry point of `data-prep`."""
-    command("prep", _run)
+    command(PREP, _run)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from extrap_train.cli import command
+from extrap_train.cli import TRAIN, command
 from extrap_train.config import TrainConfig
 from extrap_train.tasks import task
 
@@ -13,7 +13,7 @@ def _run(config: TrainConfig) -> Path | None:
 
 def main() -> None:
     """Entry point of `extrap-train`."""
-    command("train", _run)
+    command(TRAIN, _run)
 
 
 if __name__ == "__main__":

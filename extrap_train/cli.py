@@ -2,11 +2,13 @@
 is wrong.
 """
 
+import contextlib
 import errno
+import io
 import os
 import sys
 from collections.abc import Callable
-from importlib.resources import files
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +20,13 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from extrap_train import config as schema
+from extrap_train.command_options import GROUPS, CommandOptions, choices_of
+from extrap_train.config import TASKS, DataPrepConfig, TrainConfig, validate
 from extrap_train.errors import InputError
 from extrap_train.exits import ends_in_one_line
-from extrap_train.option_errors import options_of
-from extrap_train.tasks import TASKS
+from extrap_train.help_text import help_text
+from extrap_train.option_errors import explain
+from extrap_train.overrides import CommandLine
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 """What a full disk says, wherever it is written to."""
@@ -31,70 +35,48 @@ _CLOSED = (errno.EACCES, errno.EROFS)
 _NO_FOLDER = (errno.ENOTDIR, errno.ENOENT, errno.EEXIST)
 """What is said below an output that can be no folder."""
 
-_GROUPS: dict[str, list[type]] = {
-    "category": [schema.CategoryConfig],
-    "data": [schema.SyntheticConfig, schema.Co3dConfig],
-    "depth": [
-        schema.DatasetDepthConfig,
-        schema.StereoConfig,
-        schema.Mast3rConfig,
-        schema.MonocularConfig,
-    ],
-    "matcher": [
-        schema.FlowMatcherConfig,
-        schema.LoftrMatcherConfig,
-        schema.AlikedMatcherConfig,
-    ],
-    "launcher": [schema.LocalConfig, schema.SlurmConfig],
-    "model": [schema.ModelConfig],
-}
-
-_COMMANDS: dict[str, tuple[type, dict[str, list[type]], tuple[str, ...]]] = {
-    "train": (schema.TrainConfig, _GROUPS, ("experiment", "sweep")),
-    "prep": (schema.DataPrepConfig, _GROUPS, ()),
-}
-"""Tree, groups that it may have, and further choices of each command, by its file's name."""
+TRAIN = CommandOptions(
+    "python -m extrap_train", "train", TrainConfig, TASKS, ("experiment", "sweep")
+)
+PREP = CommandOptions("python -m data_prep", "prep", DataPrepConfig, {})
 
 
 def register_schemas() -> None:
-    """Make the dataclasses known to Hydra, as `<name>_schema`, and choices to its help."""
-    OmegaConf.register_new_resolver("choices", _choices, replace=True)
+    """Make the dataclasses known to Hydra, as `<name>_schema`."""
     store = ConfigStore.instance()
-    store.store(name="train_schema", node=schema.TrainConfig)
-    store.store(name="prep_schema", node=schema.DataPrepConfig)
-    for group, variants in _GROUPS.items():
+    for options in (TRAIN, PREP):
+        store.store(name=f"{options.config_name}_schema", node=options.tree)
+    for group, variants in GROUPS.items():
         for variant in variants:
             name = variant.name if len(variants) > 1 else group  # type: ignore[attr-defined]
             store.store(group=group, name=f"{name}_schema", node=variant)
 
 
-def _choices(*groups: str, _root_: Any) -> str:
-    """What may be chosen of each group, a line each; folders of one's own (`--config-dir`) count.
-
-    Hydra's own list has the schemas, too, which are no choices, and every group that there is.
-    """
-    sources = [s for s in _root_.hydra.runtime.config_sources if s.schema in ("pkg", "file")]
-    folders = [files(s.path) if s.schema == "pkg" else Path(s.path) for s in sources]
-    lines = []
-    for group in groups:
-        places = [Path(str(folder)) / group for folder in folders]
-        names = {
-            file.relative_to(place).with_suffix("").as_posix()
-            for place in places
-            for file in place.rglob("*.yaml")
-        }
-        lines.append(f"{group}: {', '.join(sorted(names))}")
-    return "\n".join(lines)
-
-
-def command(name: str, run: Callable[[Any], Path | None]) -> None:
-    """Compose the configuration `conf/<name>.yaml` with the command line's overrides and run it.
+def command(options: CommandOptions, run: Callable[[Any], Path | None]) -> None:
+    """Compose the command's configuration with the overrides in `sys.argv` and run it.
 
     `run` may return its result's folder: a sweep takes the numbers of its `summary.json`.
 
     An option that does not exist, a value of the wrong type, an unknown category and unusable input
     end with one line on stderr and exit status 1.
     """
+    with ends_in_one_line():
+        line = CommandLine.split(sys.argv[1:])
+        if {"--help", "-h"} & set(line.flags):
+            print(help_text(options, line.own_folders), end="")
+        elif "--version" in line.flags:
+            print(f"extrap-train {version('extrap-train')}")
+        elif {"-sc", "--shell-completion"} & set(line.flags):
+            _complete(options, run)
+        else:
+            for folder in line.own_folders:
+                if not Path(folder).is_dir():
+                    raise InputError(f"--config-dir {folder}: no such folder")
+            sys.argv[1:] = line.prepared(options)
+            _compose(options, run)
+
+
+def _compose(options: CommandOptions, run: Callable[[Any], Path | None]) -> None:
     register_schemas()
 
     def checked(config: DictConfig) -> Path | None:
@@ -103,7 +85,7 @@ def command(name: str, run: Callable[[Any], Path | None]) -> None:
             typed = typed_config(config)
             output = typed.output
             _check_processes(typed)
-            _use_threads(getattr(typed, "threads", None))
+            _use_threads(typed.threads)
             return run(typed)
         except OSError as error:
             said = _remedy(error, output)
@@ -112,21 +94,28 @@ def command(name: str, run: Callable[[Any], Path | None]) -> None:
             message = f"{error.filename or output}: {error.strerror}; {said}"
             raise InputError(message) from error
 
-    @hydra.main(version_base="1.3", config_path="pkg://conf", config_name=name)
+    @hydra.main(version_base="1.3", config_path="pkg://conf", config_name=options.config_name)
     def composed(config: DictConfig) -> Path | None:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             return checked(config)  # the other jobs of a sweep still run
         with ends_in_one_line():  # before Hydra adds a line of its own
             return checked(config)
 
-    with ends_in_one_line():
-        try:
-            _complete_help(sys.argv)
-            os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # what is left to go wrong is a bug
-            composed()
-        except (HydraException, OmegaConfBaseException) as error:
-            options = options_of(*_COMMANDS[name])
-            raise InputError(options.one_line(error, _overrides(sys.argv[1:]))) from None
+    try:
+        os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # what is left to go wrong is a bug
+        composed()
+    except (HydraException, OmegaConfBaseException) as error:
+        raise InputError(explain(error, options, sys.argv[1:])) from None
+
+
+def _complete(options: CommandOptions, run: Callable[[Any], Path | None]) -> None:
+    """Hydra's words for the shell, without the schemas, which are no choices."""
+    words = io.StringIO()
+    with contextlib.redirect_stdout(words):
+        _compose(options, run)
+    for word in words.getvalue().splitlines():
+        if not word.endswith("_schema"):
+            print(word)
 
 
 def _remedy(error: OSError, output: str) -> str | None:
@@ -152,36 +141,22 @@ def typed_config(config: DictConfig) -> Any:
     """The dataclass tree of a composed configuration, checked beyond its types."""
     missing = sorted(str(key) for key in OmegaConf.missing_keys(config) if key != "hydra")
     if missing:
-        raise InputError(f"an option has no value: give {missing[0]}=VALUE")
+        name = missing[0]
+        choices = "|".join(choices_of(name)) if name in GROUPS else "VALUE"
+        raise InputError(f"{name} is not given: give {name}={choices}")
     typed: Any = OmegaConf.to_object(config)
-    schema.validate(typed, TASKS)
+    validate(typed)
     return typed
 
 
 def _check_processes(config: Any) -> None:
     """Lightning starts a run's other processes with the whole command: that is the whole sweep."""
-    devices = config.trainer.devices if isinstance(config, schema.TrainConfig) else 1
+    devices = config.trainer.devices if isinstance(config, TrainConfig) else 1
     if devices > 1 and HydraConfig.get().mode == RunMode.MULTIRUN:
         raise InputError(
             f"trainer.devices={devices}: a job of a sweep trains on one device; leave it out or "
             "start the runs one by one"
         )
-
-
-def _complete_help(words: list[str]) -> None:
-    """Help shows a whole tree, for which something must be chosen; `words` are the command's."""
-    overrides = _overrides(words[1:])
-    if not {"--help", "-h"} & set(words) or any(
-        override.startswith(("category=", "experiment=")) for override in overrides
-    ):
-        return
-    place = words.index(overrides[0]) if overrides else len(words)  # they must stand together
-    words.insert(place, "category=hydrant")
-
-
-def _overrides(arguments: list[str]) -> list[str]:
-    """What is no flag of Hydra's, nor looks like the value of one."""
-    return [w for w in arguments if not w.startswith("-") and ("=" in w or w.startswith("~"))]
 
 
 def _use_threads(threads: int | None) -> None:

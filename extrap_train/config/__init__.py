@@ -1,4 +1,4 @@
-"""The configuration tree as plain dataclasses: every option, its type, its unit and its bounds.
+"""The configuration tree as plain dataclasses: every option, its type, unit, range and meaning.
 
 Light on purpose (no torch), so that `--help` is instant. YAMLs under `conf/` choose among the
 variants of a group; this package says what may stand in them.
@@ -16,7 +16,7 @@ from extrap_train.config.benchmark import (
     TableConfig,
 )
 from extrap_train.config.checks import required_file, validate, validate_model
-from extrap_train.config.commands import DataPrepConfig, TrainConfig
+from extrap_train.config.commands import TASKS, DataPrepConfig, TrainConfig
 from extrap_train.config.completion import CompletionConfig, ConfidenceConfig, SplatsConfig
 from extrap_train.config.data import (
     CATEGORIES,
@@ -50,6 +50,7 @@ from extrap_train.config.model import (
     UNetConfig,
     VaeConfig,
 )
+from extrap_train.config.options import Option, check_options, options_of
 from extrap_train.config.places import placed, placed_value
 from extrap_train.config.sampling import require_published, sampler_for
 from extrap_train.config.scene import LoraConfig, SceneOptions
@@ -64,6 +65,7 @@ __all__ = [
     "LPIPS_NETS",
     "MISSING",
     "NEAREST_ALONE",
+    "TASKS",
     "AlikedMatcherConfig",
     "CapturesConfig",
     "CategoryConfig",
@@ -85,6 +87,7 @@ __all__ = [
     "MethodConfig",
     "ModelConfig",
     "MonocularConfig",
+    "Option",
     "PrepConfig",
     "QuickConfig",
     "RulesConfig",
@@ -102,7 +105,9 @@ __all__ = [
     "UNetConfig",
     "VaeConfig",
     "ValidationConfig",
+    "check_options",
     "dotted",
+    "options_of",
     "placed",
     "placed_value",
     "require_published",

@@ -4,103 +4,114 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from extrap_train.config.launcher import SlurmConfig
+from extrap_train.config.options import option
 from extrap_train.config.tree import MISSING
 
 CAPTURE_SOURCES = ("synthetic", "co3d", "reconfusion", "scenes")
 DRAWS = ("random", "spread", "one_sided", "given")
 LPIPS_NETS = ("alex", "vgg", "squeeze")
+_SSIM_WINDOW = 11
 
 
 @dataclass
 class CapturesConfig:
     """Which test captures a table is measured on."""
 
-    source: str = "synthetic"
-    """`synthetic`, `co3d`, `reconfusion` (transforms.json with train_test_split_N.json, a folder a
-    scene) or `scenes` (any capture that `scene=` takes).
-    """
-    root: str | None = None
-    """Folder of the data set; rendered captures are made where it is null."""
-    categories: list[str] = field(default_factory=list)
-    sequences: int = 4
-    """Test sequences a category."""
-    scenes: list[str] = field(default_factory=list)
-    """For `scenes`: captures, as `scene=` takes them."""
-    frames: int = 24
-    """Photographs around a rendered scene."""
-    render_size: int = 128
-    """Pixels a side of a rendered photograph."""
-    seed: int = 0
-    """Of the rendered scenes."""
+    source: str = option(
+        "synthetic",
+        "data set: rendered, CO3D, folders with transforms.json and train_test_split_N.json, or "
+        "anything that scene= takes",
+        known=CAPTURE_SOURCES,
+    )
+    root: str | None = option(None, "folder of the data set; null renders the captures")
+    categories: list[str] = option([], "categories that are measured")
+    sequences: int = option(4, "test sequences per category", low=1, high=10_000)
+    scenes: list[str] = option([], "captures of captures.source=scenes, as scene= takes them")
+    frames: int = option(24, "photographs around a rendered scene", low=1, high=10_000)
+    render_size: int = option(128, "side of a rendered photograph", unit="pixels", low=1, high=8192)
+    seed: int = option(0, "seed of the rendered scenes", low=0, high=2**30)
 
 
 @dataclass
 class RulesConfig:
     """What every method of a table is measured by; part of every result's hash."""
 
-    image_size: int = 64
-    """Pixels a side of inputs, targets and everything that is scored."""
-    fine_scale: int = 2
-    """Side of the inputs' finer copy over `image_size`, where the photographs are as large: what
-    warps, and so the masks, are made from. Every method is given both.
-    """
-    pool: int = 9
-    """Frames that farthest-point sampling picks from a capture (paper III-A.1)."""
-    views: list[int] = field(default_factory=lambda: [3, 6])
-    """Inputs; the rest of the pool are targets."""
-    draws: list[str] = field(default_factory=lambda: ["random", "spread", "one_sided"])
-    """How the inputs are drawn from the pool."""
-    seeds: list[int] = field(default_factory=lambda: [0])
-    """Of the draws, and of the methods' own randomness."""
-    depth: str = "dataset"
-    """Where the inputs' depth comes from: `dataset` or `stereo`."""
+    image_size: int = option(
+        64,
+        "side of inputs, targets and everything that is scored",
+        unit="pixels",
+        low=_SSIM_WINDOW,
+        high=4096,
+    )
+    fine_scale: int = option(
+        2,
+        "side of the inputs' finer copy, which warps and masks are made from, as a multiple of "
+        "rules.image_size",
+        low=1,
+        high=64,
+    )
+    pool: int = option(
+        9, "frames that farthest-point sampling picks from a capture", low=2, high=10_000
+    )
+    views: list[int] = option(
+        [3, 6], "numbers of inputs; the rest of the pool are targets", low=1, high=10_000
+    )
+    draws: list[str] = option(
+        ["random", "spread", "one_sided"],
+        "how the inputs may be drawn from the pool",
+        known=DRAWS,
+    )
+    seeds: list[int] = option(
+        [0], "seeds of the draws and of the methods' own randomness", low=0, high=2**30
+    )
+    depth: str = option(
+        "dataset", "where the inputs' depth comes from", known=("dataset", "stereo")
+    )
 
 
 @dataclass
 class ScoringConfig:
     """Which perceptual networks judge, and where their weights lie."""
 
-    lpips: list[str] = field(default_factory=lambda: ["alex"])
-    """Backbones, each its own column: `alex`, `vgg`, `squeeze`."""
-    lpips_weights: dict[str, str] = field(default_factory=dict)
-    """Full `lpips.LPIPS` state dicts by net; a net that is not named takes torch's hub cache."""
-    dists: bool = True
-    """DISTS takes torchvision's VGG-16 from torch's hub cache."""
+    lpips: list[str] = option(["alex"], "LPIPS backbones, one column each", known=LPIPS_NETS)
+    lpips_weights: dict[str, str] = option(
+        {}, "full lpips.LPIPS state dicts by net; a net not named takes torch's hub cache"
+    )
+    dists: bool = option(True, "measure DISTS, with torchvision's VGG-16 from torch's hub cache")
 
 
 @dataclass
 class QuickConfig:
     """What `--quick` keeps of a table."""
 
-    categories: list[str] = field(default_factory=list)
-    sequences: int = 1
+    categories: list[str] = option([], "categories that --quick keeps")
+    sequences: int = option(1, "sequences per category that --quick keeps", low=1, high=10_000)
 
 
 @dataclass
 class TableConfig:
     """One comparison, `conf/table/NAME.yaml`."""
 
-    name: str = MISSING
-    title: str = ""
+    name: str = option(MISSING, "name of the table's folder below output")
+    title: str = option("", "heading of the reports")
     captures: CapturesConfig = field(default_factory=CapturesConfig)
     rules: RulesConfig = field(default_factory=RulesConfig)
     scoring: ScoringConfig = field(default_factory=ScoringConfig)
-    methods: list[str] = field(default_factory=list)
-    """Rows, in their order: names of `conf/method/`."""
-    options: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Options by method, over those of the method's own file: `options.ours.weights=FOLDER`."""
-    draws: list[str] = field(default_factory=lambda: ["random"])
-    """Which of the protocol's draws are run."""
+    methods: list[str] = option([], "rows in their order: names of `benchmark list methods`")
+    options: dict[str, dict[str, Any]] = option(
+        {}, "options by method, as options.ours.weights=FOLDER; they replace those of its file"
+    )
+    draws: list[str] = option(["random"], "which of rules.draws are run", known=DRAWS)
     quick: QuickConfig = field(default_factory=QuickConfig)
-    columns: list[str] = field(default_factory=list)
-    """Metrics of the printed table, in their order; the CSV holds them all."""
-    reported: str | None = None
-    """Name of the published numbers that stand beside ours: a file of `conf/reported/`."""
-    output: str = "results"
-    device: str = "auto"
-    """`cpu`, `cuda`, or `auto`: CUDA where there is one."""
+    columns: list[str] = option(
+        [], "metrics of the printed table in their order; the CSV holds all of them"
+    )
+    reported: str | None = option(
+        None, "published numbers to print beside ours: a file of conf/reported/"
+    )
+    output: str = option("results", "folder of all results")
+    device: str = option("auto", "device of the methods: cpu, cuda, or auto: CUDA if there is one")
     slurm: SlurmConfig = field(default_factory=SlurmConfig)
-    """Of `--slurm`: `slurm.partition=NAME slurm.hours=2`."""
 
 
 @dataclass

@@ -8,9 +8,20 @@ from extrap_train.config.depth import DepthConfig
 from extrap_train.config.launcher import LauncherConfig
 from extrap_train.config.matching import MatcherConfig
 from extrap_train.config.model import ModelConfig, SamplerOptions
+from extrap_train.config.options import option
 from extrap_train.config.scene import SceneOptions
 from extrap_train.config.training import TrainerConfig, ValidationConfig
 from extrap_train.config.tree import MISSING
+
+TASKS = {
+    "category": "prepare a category, train its model, and measure it on held-out sequences",
+    "complete": "complete a scene all around: point cloud, views, Gaussians, turntable",
+    "pack": "write a trained model as a packaged one",
+    "scene": "adapt a model to one scene (LoRA)",
+    "validate": "measure a trained model on held-out sequences",
+    "view": "make one view of a scene (pose=) or a walk around it (orbit=)",
+}
+"""What each value of `task=` does."""
 
 
 @dataclass
@@ -27,16 +38,15 @@ class TrainConfig(SceneOptions):
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
     validation: ValidationConfig = field(default_factory=ValidationConfig)
     complete: CompletionConfig = field(default_factory=CompletionConfig)
-    task: str = "category"
-    seed: int = 0
-    run: str | None = None
-    """Name of the run's folder; by default made from the configuration, so that the same command
-    resumes.
-    """
-    resume: bool = True
-    output: str = "outputs"
-    threads: int | None = None
-    """CPU threads; null takes every core."""
+    task: str = option("category", "what to do; see Tasks", known=tuple(TASKS))
+    seed: int = option(0, "seed of everything random", low=0, high=2**30)
+    run: str | None = option(
+        None,
+        "name of the run's folder; null: made from the options, so that the same command resumes",
+    )
+    resume: bool = option(True, "continue or reuse what is there; false replaces it")
+    output: str = option("outputs", "folder of all results")
+    threads: int | None = option(None, "CPU threads; null: every core", low=1)
 
 
 @dataclass
@@ -49,7 +59,12 @@ class DataPrepConfig:
     matcher: MatcherConfig = MISSING
     launcher: LauncherConfig = MISSING
     prep: PrepConfig = field(default_factory=PrepConfig)
-    output: str = "outputs"
-    workers: int | None = None
-    """Processes on this machine; null takes every core, but one process where a network for depth
-    or matches runs on a GPU."""
+    output: str = option("outputs", "folder of all results")
+    workers: int | None = option(
+        None,
+        "processes on this machine; null: one per thread, or one alone for a network on a GPU",
+        low=1,
+    )
+    threads: int | None = option(
+        None, "CPU threads of all processes together; null: every core", low=1
+    )

@@ -2,73 +2,96 @@
 
 from dataclasses import dataclass, field
 
+from extrap_train.config.options import option
+
 
 @dataclass
 class ConfidenceConfig:
     """What keeps misaligned pixels out of the map; each part can be switched off."""
 
-    repair: bool = True
-    """Where a new depth contradicts a surer one in the map, the map's is taken."""
-    free_space: bool = True
-    """Pixels in front of what a surer view has seen are left out."""
-    support: bool = True
-    """A view's confidence is scaled by the share of it that the map confirms, and is less where few
-    of its edges measure a pixel."""
-    votes: bool = True
-    """Points that more views contradict than confirm are left out of the cloud."""
-    regenerate: bool = True
-    """A view that contradicts the map is generated again with another seed."""
-    reject: bool = True
-    """What a view that still contradicts the map shows for the first time is left out."""
-    attempts: int = 3
-    """Most pictures of one view; the best one is kept."""
-    least_agreement: float = 0.5
-    """Share of a view's testable pixels that must agree with the map."""
-    least_confidence: float = 0.1
-    """Of a point of the cloud."""
+    repair: bool = option(True, "replace a new depth by the map's where the map's is more certain")
+    free_space: bool = option(
+        True, "leave out pixels in front of surfaces that a more certain view has seen"
+    )
+    support: bool = option(
+        True, "scale a view's confidence by the share of it that the map confirms"
+    )
+    votes: bool = option(
+        True, "leave out points of the cloud that more views contradict than confirm"
+    )
+    regenerate: bool = option(
+        True, "generate a view that contradicts the map again with another seed"
+    )
+    reject: bool = option(
+        True, "leave out what a view that still contradicts the map shows for the first time"
+    )
+    attempts: int = option(
+        3, "most attempts at one view, of which the best is kept", low=1, high=100
+    )
+    least_agreement: float = option(
+        0.5, "share of a view's testable pixels that must agree with the map", low=0, high=1
+    )
+    least_confidence: float = option(
+        0.1, "confidence below which a point is left out of the cloud", low=0, high=1
+    )
 
 
 @dataclass
 class SplatsConfig:
     """The Gaussians fitted to a completed scene's views: `splats.ply`."""
 
-    fit: bool = True
-    """Whether they are."""
-    iterations: int = 500
-    """Of 3DGS's optimisation."""
-    count: int = 10_000
-    """Most Gaussians."""
+    fit: bool = option(True, "fit Gaussians to the completed views (splats.ply)")
+    iterations: int = option(500, "optimisation steps of 3DGS", low=1, high=1_000_000)
+    count: int = option(10_000, "most Gaussians", low=1, high=10_000_000)
 
 
 @dataclass
 class CompletionConfig:
-    """From a few posed photographs to a full turn (paper II-C; METHOD §5)."""
+    """From a few posed photographs to a full turn (paper II-C)."""
 
-    draw: str = "one_sided"
-    """How `inputs` photographs are drawn: `one_sided` neighbours, or `spread` around the scene."""
-    poses: str = "orbit"
-    """Where new views are made: on the `orbit` fitted to the inputs, or at the `capture`'s other
-    poses."""
-    step_deg: float = 30.0
-    """Angle from view to view around the orbit; gaps are divided evenly."""
-    edges: int = 4
-    """Known views that a new one is aligned to."""
-    tolerance: float = 0.01
-    """Relative difference of depth up to which two views show the same surface."""
-    generator: str = "model"
-    """`model` samples pictures; `exact` renders them and their depth, synthetic scenes only."""
+    draw: str = option(
+        "one_sided",
+        "how the inputs are chosen: neighbours, or spread around the scene",
+        known=("one_sided", "spread"),
+    )
+    poses: str = option(
+        "orbit",
+        "where new views are made: on the orbit fitted to the inputs, or at the capture's poses",
+        known=("orbit", "capture"),
+    )
+    step_deg: float = option(
+        30.0, "angle between neighbouring views of the orbit", unit="degrees", low=1, high=180
+    )
+    edges: int = option(4, "known views that a new one is aligned to", low=1, high=64)
+    tolerance: float = option(
+        0.01,
+        "relative difference in depth up to which two views show the same surface",
+        low=1e-4,
+        high=0.5,
+    )
+    generator: str = option(
+        "model",
+        "what makes new views: the model, or the exact renderer of a synthetic scene",
+        known=("model", "exact"),
+    )
     confidence: ConfidenceConfig = field(default_factory=ConfidenceConfig)
     splats: SplatsConfig = field(default_factory=SplatsConfig)
-    exact_size: int = 128
-    """Side of the pictures of `generator=exact`, in pixels; a model has its own."""
-    held_out: int = 20
-    """Most photographs that are no inputs with which views generated at their poses are compared.
-    """
-    dry_run: bool = False
-    """Print and draw the plan, and stop."""
-    viewer: bool = False
-    """Show the growing cloud in a browser; needs the extra `viewer`."""
-    host: str = "127.0.0.1"
-    """Address that the viewer listens on: this machine alone; `0.0.0.0` lets others see it, too."""
-    port: int = 8080
-    """Port of the viewer, or the next free one."""
+    exact_size: int = option(
+        128,
+        "side of the views of complete.generator=exact; a model has its own",
+        unit="pixels",
+        low=16,
+        high=4096,
+    )
+    held_out: int = option(
+        20,
+        "most photographs that are no inputs and are compared with views at their poses",
+        low=0,
+    )
+    dry_run: bool = option(False, "print and draw the plan, and stop")
+    viewer: bool = option(False, "show the growing cloud in a browser; needs the extra `viewer`")
+    host: str = option(
+        "127.0.0.1",
+        "address that the viewer listens on: this machine only; 0.0.0.0 lets others see it too",
+    )
+    port: int = option(8080, "port of the viewer, or the next free one", low=1, high=65535)

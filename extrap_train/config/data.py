@@ -1,7 +1,8 @@
 """Where photographs come from, and which of them become training data."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
+from extrap_train.config.options import option
 from extrap_train.config.tree import MISSING
 
 CATEGORIES = ("apple", "book", "chair", "cup", "hydrant", "teddybear")
@@ -11,18 +12,16 @@ CATEGORIES = ("apple", "book", "chair", "cup", "hydrant", "teddybear")
 class CategoryConfig:
     """What the model is trained on: one category, or several for a base model."""
 
-    name: str = MISSING
-    members: list[str] = field(default_factory=list)
-    """CO3D's names of the categories; one, but for `all`."""
+    name: str = option(MISSING, "name of the category in results")
+    members: list[str] = option([], "CO3D's names of the categories: one, or several")
 
 
 @dataclass
 class DataConfig:
-    """Where sequences come from; one subclass a source."""
+    """Where sequences come from; one subclass per source."""
 
     name: str = MISSING
-    root: str | None = None
-    """Folder of the data set; made where the source makes its own."""
+    root: str | None = option(None, "folder of the data set; null renders synthetic data")
 
 
 @dataclass
@@ -30,16 +29,19 @@ class SyntheticConfig(DataConfig):
     """Rendered sequences in CO3D's layout, the same on every machine."""
 
     name: str = "synthetic"
-    test_sequences: int = 5
-    """Sequences 0 … n-1 are for testing, whatever else is asked for."""
-    train_sequences: int = 100
-    """The sequences behind those."""
-    frames: int = 24
-    """Photographs around each scene."""
-    image_size: int = 128
-    """Pixels of the square photographs."""
-    seed: int = 0
-    """Of shapes, materials, light and the walks around them."""
+    test_sequences: int = option(
+        5, "sequences 0 to n-1, which are always for testing", low=1, high=10_000
+    )
+    train_sequences: int = option(100, "sequences after those, for training", low=1, high=10_000)
+    frames: int = option(24, "photographs around each scene", low=2, high=10_000)
+    image_size: int = option(
+        128,
+        "side of the rendered photographs; views are painted at model.image_size",
+        unit="pixels",
+        low=8,
+        high=8192,
+    )
+    seed: int = option(0, "seed of shapes, materials, light and camera paths", low=0, high=2**30)
 
 
 @dataclass
@@ -47,39 +49,81 @@ class Co3dConfig(DataConfig):
     """A CO3D v1 or v2 download."""
 
     name: str = "co3d"
-    test_sequences: int = 5
-    """Drawn by a hash of the sequence's name; a lone sequence holds out frames instead."""
-    set_list: str | None = None
-    """CO3D's own division instead, as `fewview_dev`: its train and test sequences, no others."""
+    test_sequences: int = option(
+        5,
+        "test sequences, drawn by a hash of their names; a lone sequence holds out frames instead",
+        low=1,
+        high=10_000,
+    )
+    set_list: str | None = option(
+        None, "one of CO3D's own splits instead, as fewview_dev: its train and test sequences only"
+    )
 
 
 @dataclass
 class PrepConfig:
     """Which sequences and pairs become training data (paper III-A.1)."""
 
-    image_size: int = 128
-    """Side of the stored square frames, in pixels: the size that warps are made at, which is
-    `model.warp_scale` times `model.image_size`."""
-    max_gap_deg: float = 30.0
-    """Largest azimuth gap between neighbouring cameras of a 360° sequence."""
-    min_coverage_deg: float = 300.0
-    """Least azimuth covered around the fitted orbit axis."""
-    min_viewpoint_quality: float = 0.0
-    """CO3D's own score of a sequence's cameras, where it has one."""
-    min_point_cloud_quality: float = -2.0
-    """CO3D's own score of a sequence's point cloud, where it has one."""
-    max_uses: int = 16
-    """Most pairs that one frame takes part in."""
-    min_pair_angle_deg: float = 8.0
-    """Least angle between the views of a pair, seen from the scene's centre."""
-    max_pair_angle_deg: float = 88.0
-    """Greatest angle between the views of a pair."""
-    near_duplicate_deg: float = 6.0
-    """A pair is skipped if a chosen one has both its frames within this angle of its own."""
-    full_circle: str = "prefer"
-    """No full circle: `require` drops it, `prefer` unless nothing is one, `ignore` never."""
-    correct: bool | None = None
-    """Correct training warps by matching them to the truth; null wherever depth is not exact, which
-    only that of synthetic data is."""
-    correction_grid: int = 12
-    """Control points of a correction along each side."""
+    image_size: int = option(
+        128,
+        "side of the stored frames, which warps are made at: model.warp_scale x model.image_size",
+        unit="pixels",
+        low=1,
+        high=4096,
+    )
+    max_gap_deg: float = option(
+        30.0,
+        "largest azimuth gap between neighbouring cameras of a full circle",
+        unit="degrees",
+        low=0,
+        high=360,
+    )
+    min_coverage_deg: float = option(
+        300.0,
+        "least azimuth that a full circle covers around the fitted orbit axis",
+        unit="degrees",
+        low=0,
+        high=360,
+    )
+    min_viewpoint_quality: float = option(
+        0.0,
+        "least of CO3D's own score of a sequence's cameras, if there is one",
+        low=-1e3,
+        high=1e3,
+    )
+    min_point_cloud_quality: float = option(
+        -2.0,
+        "least of CO3D's own score of a sequence's point cloud, if there is one",
+        low=-1e3,
+        high=1e3,
+    )
+    max_uses: int = option(16, "most pairs that one frame takes part in", low=1)
+    min_pair_angle_deg: float = option(
+        8.0,
+        "least angle between the views of a pair, seen from the scene's centre",
+        unit="degrees",
+        low=0,
+        high=90,
+    )
+    max_pair_angle_deg: float = option(
+        88.0, "greatest angle between the views of a pair", unit="degrees", low=0, high=90
+    )
+    near_duplicate_deg: float = option(
+        6.0,
+        "skip a pair if both its frames are this close to those of a chosen one",
+        unit="degrees",
+        low=0,
+        high=180,
+    )
+    full_circle: str = option(
+        "prefer",
+        "sequences that are no full circle: drop them, drop them if others are one, or keep them",
+        known=("require", "prefer", "ignore"),
+    )
+    correct: bool | None = option(
+        None,
+        "correct training warps by matching them to the photograph; null: unless depth is exact",
+    )
+    correction_grid: int = option(
+        12, "control points of a correction along each side", low=4, high=64
+    )

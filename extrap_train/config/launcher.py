@@ -1,13 +1,14 @@
 """Where independent jobs run."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
+from extrap_train.config.options import option
 from extrap_train.config.tree import MISSING
 
 
 @dataclass
 class LauncherConfig:
-    """Where independent jobs run; one subclass a kind of place."""
+    """Where independent jobs run; one subclass per kind of place."""
 
     name: str = MISSING
 
@@ -21,19 +22,27 @@ class LocalConfig(LauncherConfig):
 
 @dataclass
 class SlurmConfig(LauncherConfig):
-    """One SLURM job array; the command waits for it and puts the results together."""
+    """One SLURM job array; the command waits for it and gathers the results."""
 
     name: str = "slurm"
-    partition: str | None = None
-    account: str | None = None
-    tasks: int = 200
-    """Array tasks that the jobs are dealt to; clusters allow 1001 unless told otherwise."""
-    at_once: int = 50
-    """Most array tasks that run at a time."""
-    cpus: int = 1
-    memory_gib: float = 4.0
-    hours: float = 4.0
-    """Time limit of a task. What it has not finished then is submitted again, an item a task; give
-    a share's time (`tasks` shares), or all its unfinished items wait for tasks of their own."""
-    directives: dict[str, str] = field(default_factory=dict)
-    """Further `sbatch` options by their long names, e.g. {constraint: avx512}."""
+    partition: str | None = option(None, "partition of the job array")
+    account: str | None = option(None, "account that the job array is charged to")
+    tasks: int = option(
+        200,
+        "array tasks that the jobs are divided among; clusters allow 1001 by default",
+        low=1,
+        high=1_000_000,
+    )
+    at_once: int = option(50, "most array tasks that run at a time", low=1, high=1_000_000)
+    cpus: int = option(1, "cores per task", low=1, high=1024)
+    memory_gib: float = option(4.0, "memory per task", unit="GiB", low=0.5, high=4096)
+    hours: float = option(
+        4.0,
+        "time limit of a task; unfinished jobs are submitted again, one per task",
+        unit="hours",
+        low=0.02,
+        high=10_000,
+    )
+    directives: dict[str, str] = option(
+        {}, "further sbatch options by their long names, as {constraint: avx512}"
+    )

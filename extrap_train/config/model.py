@@ -3,7 +3,8 @@
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from extrap_train.config.tree import MISSING, require_one_of
+from extrap_train.config.options import option, unset
+from extrap_train.config.tree import MISSING
 
 FAMILIES = ("zeronvs", "megascenes", "ours")
 """What a denoiser may be told about the query view; `extrap_train.diffusion.family` has each."""
@@ -15,77 +16,94 @@ NEAREST_ALONE = ("zeronvs", "megascenes")
 class UNetConfig:
     """Shape of the denoiser (diffusers' `UNet2DConditionModel`)."""
 
-    channels: list[int] = field(default_factory=lambda: [32, 64, 128, 192])
-    """Width of each level, finest first."""
-    layers_per_block: int = 1
-    attention_levels: list[bool] = field(default_factory=lambda: [False, False, False, True])
-    """Which levels attend, finest first."""
-    heads: int = 4
-    """Of each attention."""
-    token_width: int = 192
-    """Width of the one cross-attention token."""
-    norm_groups: int = 16
-    """Of the normalisations; the widths of the levels are multiples of it."""
+    channels: list[int] = option(
+        [32, 64, 128, 192],
+        "width of each level, finest first; multiples of model.unet.norm_groups",
+        low=1,
+        high=65_536,
+    )
+    layers_per_block: int = option(1, "residual layers per block", low=1, high=16)
+    attention_levels: list[bool] = option(
+        [False, False, False, True], "levels that attend, finest first"
+    )
+    heads: int = option(4, "heads of each attention", low=1, high=64)
+    token_width: int = option(192, "width of the cross-attention token", low=1, high=8192)
+    norm_groups: int = option(16, "groups of the normalisations", low=1, high=1024)
 
 
 @dataclass
 class VaeConfig:
     """Shape of the latent space's autoencoder (diffusers' `AutoencoderKL`); Stable Diffusion's."""
 
-    channels: list[int] = field(default_factory=lambda: [128, 256, 512, 512])
-    layers_per_block: int = 2
+    channels: list[int] = option(
+        [128, 256, 512, 512], "width of each level, finest first", low=1, high=65_536
+    )
+    layers_per_block: int = option(2, "residual layers per block", low=1, high=16)
 
 
 @dataclass
 class ClipConfig:
     """Shape of CLIP's image tower at 224² pixels in patches of 14²; ViT-L/14's."""
 
-    width: int = 1024
-    layers: int = 24
-    heads: int = 16
-    embedding_width: int = 768
+    width: int = option(1024, "width of the layers", low=1, high=8192)
+    layers: int = option(24, "number of layers", low=1, high=64)
+    heads: int = option(16, "heads of each attention", low=1, high=64)
+    embedding_width: int = option(768, "width of the embedding", low=1, high=8192)
 
 
 @dataclass
 class SamplerConfig:
     """How a view is sampled; the defaults are the small model's."""
 
-    solver: str = "ddim"
-    """`ddim` (paper), or of second order, for few steps: `dpmpp` (DPM-Solver++ 2M), `unipc`."""
-    steps: int = 2
-    """Evaluations of the denoiser."""
-    eta: float = 0.0
-    """Share of DDIM's noise that is drawn anew at every step; 0 is deterministic."""
-    guidance: float = 1.0
-    """Weight of the conditional prediction against the null condition's; 1 is no guidance."""
-    guidance_rescale: float = 0.0
-    """How far guidance's wider spread is taken back (Lin et al. 2023); they use 0.7."""
-    compat: str | None = None
-    """`megascenes` samples as ZeroNVS and MegaScenes were published: guidance against plain zeros,
-    which their training never saw, and the noisiest step left out.
-    """
+    solver: str = option(
+        "ddim",
+        "sampler: DDIM (paper), or of second order for few steps",
+        known=("ddim", "dpmpp", "unipc"),
+    )
+    steps: int = option(2, "evaluations of the denoiser", low=1, high=1000)
+    eta: float = option(
+        0.0,
+        "share of DDIM's noise that is drawn again at each step; 0: deterministic",
+        low=0,
+        high=1,
+    )
+    guidance: float = option(
+        1.0,
+        "guidance scale: weight of the conditional against the null prediction; 1: none",
+        low=0,
+        high=100,
+    )
+    guidance_rescale: float = option(
+        0.0,
+        "how far the wider spread from guidance is undone (Lin et al. 2023 use 0.7)",
+        low=0,
+        high=1,
+    )
+    compat: str | None = option(
+        None,
+        "sample as ZeroNVS and MegaScenes were published: guidance against zeros, without the "
+        "noisiest step",
+        known=("megascenes",),
+    )
 
 
 @dataclass
 class SamplerOptions:
     """What a command says of `SamplerConfig`; null leaves it at what the model recommends."""
 
-    solver: str | None = None
-    steps: int | None = None
-    eta: float | None = None
-    guidance: float | None = None
-    guidance_rescale: float | None = None
-    compat: str | None = None
-    without: list[str] = field(default_factory=list)
-    """What the model recommends and is not wanted: `compat`."""
+    solver: str | None = unset(SamplerConfig, "solver")
+    steps: int | None = unset(SamplerConfig, "steps")
+    eta: float | None = unset(SamplerConfig, "eta")
+    guidance: float | None = unset(SamplerConfig, "guidance")
+    guidance_rescale: float | None = unset(SamplerConfig, "guidance_rescale")
+    compat: str | None = unset(SamplerConfig, "compat")
+    without: list[str] = option([], "recommendations of the model to leave out", known=("compat",))
 
     def over(self, recommended: SamplerConfig) -> SamplerConfig:
         """The model's recommendation with what is said here put over it.
 
         Asked for another solver than DDIM, it leaves out what is recommended for DDIM alone.
         """
-        for name in self.without:
-            require_one_of("sampler.without", name, ("compat",))
         said = {name: value for name, value in vars(self).items() if value is not None}
         left_out: dict[str, Any] = dict.fromkeys(said.pop("without"))
         if said.get("solver", "ddim") != "ddim":
@@ -95,57 +113,76 @@ class SamplerOptions:
 
 @dataclass
 class ModelConfig:
-    """A denoiser with its conditioning (METHOD: paper II-B)."""
+    """A denoiser with its conditioning (paper II-B)."""
 
     name: str = MISSING
-    family: str = "ours"
-    """What the denoiser is told: `zeronvs` pose only, `megascenes` pose and the nearest reference's
-    warp, `ours` the fused warp, its positional encoding and its mask, too.
-    """
-    image_size: int = 64
-    """Side of the square views that it paints, in pixels."""
-    warp_scale: int = 2
-    """Side of the warp over `image_size`: made finer and then reduced, thin surfaces survive it."""
+    family: str = option(
+        "ours",
+        "what the denoiser is told: the pose, the nearest reference's warp too, or the fused warp "
+        "with its encoding and mask",
+        known=FAMILIES,
+    )
+    image_size: int = option(
+        64, "side of the square views that are painted", unit="pixels", low=8, high=4096
+    )
+    warp_scale: int = option(
+        2,
+        "side of the warp as a multiple of model.image_size; finer warps keep thin surfaces",
+        low=1,
+        high=8,
+    )
     vae: VaeConfig | None = None
     """Autoencoder of the latents; null takes patches of pixels."""
-    patch: int = 2
-    """Pixels a side that become channels of one latent: the small model's stand-in for a VAE."""
+    patch: int = option(
+        2,
+        "side of the patches that latents are made of without model.vae",
+        unit="pixels",
+        low=1,
+        high=64,
+    )
     clip: ClipConfig | None = None
-    """Encoder of the reference image; null takes a small one that is trained along."""
-    references: int = 3
-    """Most references that a view is warped from (paper III-A.4); 1 for the families that are told
-    of the nearest alone.
-    """
-    octaves: int = 4
-    """Of the positional encoding: 4 channels each."""
-    geometry: bool = False
-    """Tell the denoiser the warp's depth and confidence, too; `ours` only: two more input channels,
-    which start at zero upon weights without them, the packaged base's among them.
-    """
-    residual: bool = True
-    """Denoise the difference to the hole-filled warp instead of the image itself: to the fused one,
-    or for `megascenes` to the nearest reference's. `zeronvs` is told no warp.
-    """
-    prediction: str = "sample"
-    """What the denoiser says: `epsilon` (the noise), `v_prediction` or `sample` (the latent)."""
-    zero_terminal_snr: bool = True
-    """The noisiest step is pure noise, as sampling starts from (Lin et al. 2023)."""
+    """Encoder of the reference image; null takes a small one that is trained with the model."""
+    references: int = option(
+        3,
+        "most references that a view is warped from; 1 for zeronvs and megascenes",
+        low=1,
+        high=16,
+    )
+    octaves: int = option(4, "octaves of the positional encoding, 4 channels each", low=1, high=16)
+    geometry: bool = option(
+        False, "condition on the warp's depth and confidence as well; model.family=ours only"
+    )
+    residual: bool = option(
+        True, "denoise the difference to the hole-filled warp instead of the image itself"
+    )
+    prediction: str = option(
+        "sample",
+        "what the denoiser predicts: the noise, v, or the clean latent",
+        known=("epsilon", "v_prediction", "sample"),
+    )
+    zero_terminal_snr: bool = option(
+        True, "make the noisiest step pure noise, as sampling starts from (Lin et al. 2023)"
+    )
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
     """How its views are sampled where the command's `sampler` says nothing else; it is saved with
     the weights.
     """
     unet: UNetConfig = field(default_factory=UNetConfig)
-    learning_rate: float = 3e-4
-    """Of AdamW, after the warm-up."""
-    projection_rate: float = 1.0
-    """Learning rate of the token's projection, as a multiple of `learning_rate`."""
-    weight_decay: float = 0.01
-    """Of AdamW."""
-    start: str | None = None
-    """What training starts from: a model folder, a published checkpoint (ZeroNVS's .ckpt,
-    MegaScenes's iter_N folder, a diffusers folder), or `base`, the packaged model; null is random.
-    Weights of another family are taken over where they mean the same (`diffusion.transfer`).
-    """
+    learning_rate: float = option(
+        3e-4, "learning rate of AdamW after the warm-up", low=1e-9, high=1
+    )
+    projection_rate: float = option(
+        1.0,
+        "learning rate of the token's projection, as a multiple of model.learning_rate",
+        low=0,
+        high=1e6,
+    )
+    weight_decay: float = option(0.01, "weight decay of AdamW", low=0, high=1)
+    start: str | None = option(
+        None,
+        "weights that training starts from: a model folder, a published checkpoint, or `base`, "
+        "the packaged model; null: random",
+    )
 
     @property
     def warp_size(self) -> int:

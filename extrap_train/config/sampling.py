@@ -1,7 +1,7 @@
 """Whether a model can be sampled as it is asked to be."""
 
 from extrap_train.config.model import ModelConfig, SamplerConfig, SamplerOptions
-from extrap_train.config.tree import require_one_of
+from extrap_train.config.options import check_options
 from extrap_train.errors import InputError
 
 _PUBLISHED_STEPS = tuple(n for n in range(2, 501) if 1000 % n == 0)
@@ -39,9 +39,7 @@ def require_published(sampler: SamplerConfig, prediction: str, *, zero_terminal_
 
 def check_sampler(sampler: SamplerConfig) -> None:
     """InputError for settings that no model can be sampled with."""
-    require_one_of("sampler.solver", sampler.solver, ("ddim", "dpmpp", "unipc"))
-    if sampler.compat is not None:
-        require_one_of("sampler.compat", sampler.compat, ("megascenes",))
+    check_options(sampler, "sampler.")
     if sampler.solver != "ddim" and (sampler.eta > 0 or sampler.compat):
         raise InputError(
             f"sampler.solver={sampler.solver} is deterministic and none of the published runs: "

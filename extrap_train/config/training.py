@@ -2,56 +2,78 @@
 
 from dataclasses import dataclass
 
+from extrap_train.config.options import option
+
 
 @dataclass
 class TrainerConfig:
     """How long, how often, on what."""
 
-    steps: int = 1200
-    """Optimiser steps; more than a finished run has prolong it."""
-    batch_size: int = 16
-    """Views a step and device."""
-    warmup_steps: int = 100
-    """Steps in which the learning rate rises to its full height."""
-    full_rate_steps: int = 400
-    """Steps at the full learning rate; from there it falls as 1/√step (Karras et al. 2024), which,
-    unlike a decay towards a last step, leaves a run that can be prolonged.
-    """
-    condition_dropout: float = 0.05
-    """Share of the training examples whose condition is the null condition."""
-    min_snr: float | None = None
-    """Greatest weight of a noise level by its signal-to-noise ratio (Hang et al. 2023: 5); null
-    weighs all alike.
-    """
-    ema_decay: float = 0.999
-    """Of the averaged weights; 0 keeps no average, which saves their memory."""
-    precision: str = "bf16-mixed"
-    """Lightning's name of it: `bf16-mixed`, `16-mixed` or `32-true`."""
-    gradient_checkpointing: bool = False
-    """Compute the denoiser's activations twice instead of keeping them: less memory, more time."""
-    compile: bool = False
-    """Compile the denoiser with torch.compile: minutes at the start, faster steps on a GPU."""
-    accelerator: str = "auto"
-    """`cpu`, `gpu`, or `auto`: a GPU where there is one."""
-    devices: int = 1
-    """GPUs, each with its own batch (distributed data parallel)."""
-    checkpoint_every: int = 200
-    """Steps; a killed run loses at most this many."""
-    validate_every: int = 400
-    """Steps; a multiple of `checkpoint_every`."""
-    workers: int = 0
-    """Processes that load batches beside the training process."""
+    steps: int = option(1200, "optimiser steps; more than a finished run has continue it", low=1)
+    batch_size: int = option(16, "views per step and device", low=1)
+    warmup_steps: int = option(
+        100, "steps in which the learning rate rises to its full height", low=0
+    )
+    full_rate_steps: int = option(
+        400,
+        "steps at the full learning rate, which then falls as 1/sqrt(step), so that a run can be "
+        "continued",
+        low=1,
+    )
+    condition_dropout: float = option(
+        0.05, "share of the examples that are trained without their condition", low=0, high=1
+    )
+    min_snr: float | None = option(
+        None,
+        "clamp of the loss weight by signal-to-noise ratio (Hang et al. 2023: 5); null: no "
+        "weighting",
+        low=0.01,
+        high=1e6,
+    )
+    ema_decay: float = option(
+        0.999,
+        "decay of the averaged weights; 0 keeps no average and saves its memory",
+        low=0,
+        high=0.999999,
+    )
+    precision: str = option(
+        "bf16-mixed",
+        "Lightning's precision; weights stay in single precision",
+        known=("32-true", "bf16-mixed", "16-mixed"),
+    )
+    gradient_checkpointing: bool = option(
+        False, "compute the denoiser's activations twice: less memory, more time"
+    )
+    compile: bool = option(
+        False, "compile the denoiser: minutes at the start, faster steps on a GPU"
+    )
+    accelerator: str = option(
+        "auto",
+        "hardware to train on; auto takes a GPU if there is one",
+        known=("auto", "cpu", "gpu", "cuda", "mps"),
+    )
+    devices: int = option(1, "GPUs, each with its own batch (distributed data parallel)", low=1)
+    checkpoint_every: int = option(
+        200, "steps between checkpoints; a killed run loses at most these", low=1
+    )
+    validate_every: int = option(
+        400,
+        "steps between validations, a multiple of trainer.checkpoint_every",
+        low=1,
+    )
+    workers: int = option(
+        0, "processes that load batches besides the training process", low=0, high=1024
+    )
 
 
 @dataclass
 class ValidationConfig:
     """What the trained model is measured on: held-out sequences."""
 
-    examples: int = 60
-    """Held-out views, spread evenly over the test pairs."""
-    batch_size: int = 20
-    """Views that are sampled at a time."""
-    pictures: int = 8
-    """Rows of the picture sheet."""
-    lpips_weights: str | None = None
-    """A full `lpips.LPIPS(net="squeeze")` state dict; null takes torchvision's cached backbone."""
+    examples: int = option(60, "held-out views, spread evenly over the test pairs", low=1)
+    batch_size: int = option(20, "views sampled at a time", low=1)
+    pictures: int = option(8, "rows of the picture sheet", low=1)
+    lpips_weights: str | None = option(
+        None,
+        'full lpips.LPIPS(net="squeeze") state dict; null: torchvision\'s cached backbone',
+    )

@@ -4,19 +4,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-TASKS = (
-    "category",
-    "complete",
-    "pack",
-    "scene",
-    "validate",
-    "view",
-)
-"""Known values of `task=`; each is a module here with `run(config)`."""
-
 
 def task(name: str) -> Callable[[Any], Path | None]:
-    """The task's function, imported only now: `--help` needs no torch.
+    """The function of the task called `name`, imported only now: `--help` needs no torch.
 
     It returns the folder of its result, where there is a `summary.json` in it.
     """

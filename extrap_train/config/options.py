@@ -1,0 +1,144 @@
+"""Options declare themselves: what one means, its unit and its range stand beside its field."""
+
+import copy
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import MISSING as NO_DEFAULT
+from dataclasses import Field, dataclass, field, fields, is_dataclass
+from functools import cache
+from types import UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+from extrap_train.config.tree import MISSING, require_one_of
+from extrap_train.errors import InputError
+
+_KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
+
+
+@dataclass(frozen=True)
+class Declared:
+    """What a field says of itself."""
+
+    help: str = ""
+    unit: str = ""
+    low: int | float = -math.inf
+    high: int | float = math.inf
+    known: tuple[str, ...] = ()
+    """The words that a text may be; empty where any is right."""
+
+
+@dataclass(frozen=True)
+class Option:
+    """One option of a command."""
+
+    name: str
+    """Dotted, as it is typed."""
+    kind: type
+    """`int`, `float`, `bool`, `str`, or `dict`; of a list that of its items."""
+    is_list: bool
+    may_be_null: bool
+    default: Any
+    declared: Declared
+
+    @property
+    def has_range(self) -> bool:
+        """Whether at least one end of it is declared."""
+        return math.isfinite(self.declared.low) or math.isfinite(self.declared.high)
+
+    @property
+    def must_be(self) -> str:
+        """What a value of it is."""
+        if self.is_list:
+            return "must be a list, as [a,b]" if self.kind is str else "must be a list, as [1,2]"
+        return self.item_must_be
+
+    @property
+    def item_must_be(self) -> str:
+        """What a value of it is, or of a list one of its values."""
+        if self.declared.known:
+            return f"must be one of {', '.join(self.declared.known)}"
+        return f"must be {_KINDS.get(self.kind, 'a mapping, as {name: value}')}"
+
+    @property
+    def range(self) -> str:
+        """The values that a number may take; empty where that is not limited."""
+        low, high = self.declared.low, self.declared.high
+        if math.isfinite(low) and math.isfinite(high):
+            return f"from {_plain(low)} to {_plain(high)}"
+        return f"at least {_plain(low)}" if math.isfinite(low) else ""
+
+    def check(self, value: Any) -> None:
+        """InputError where the value is out of the range or not among the known words."""
+        for item in value if isinstance(value, list | tuple) else (value,):
+            if isinstance(item, str) and self.declared.known:
+                require_one_of(self.name, item, self.declared.known)
+            is_number = isinstance(item, int | float)
+            if is_number and not self.declared.low <= item <= self.declared.high:
+                raise InputError(f"{self.name}={value}: must be {self.range}")
+
+
+def option(
+    default: Any,
+    meaning: str,
+    *,
+    unit: str = "",
+    low: int | float = -math.inf,
+    high: int | float = math.inf,
+    known: tuple[str, ...] = (),
+) -> Any:
+    """A dataclass field that is an option, with its default."""
+    metadata = {"option": Declared(meaning, unit, low, high, known)}
+    if isinstance(default, list | dict):
+        return field(default_factory=lambda: copy.copy(default), metadata=metadata)
+    return field(default=default, metadata=metadata)
+
+
+def unset(tree: type, name: str) -> Any:
+    """An option that means what `tree`'s of that name means, and is null unless it is given."""
+    return field(default=None, metadata=tree.__dataclass_fields__[name].metadata)  # type: ignore[attr-defined]
+
+
+@cache
+def options_of(tree: type, prefix: str = "") -> Mapping[str, Option]:
+    """Every option of a tree of dataclasses, by its dotted name."""
+    return {found.name: found for found in _walk(tree, prefix)}
+
+
+def check_options(tree: Any, prefix: str = "") -> None:
+    """InputError for the first value of an instance that its field's declaration does not allow."""
+    for name, value in vars(tree).items():
+        if is_dataclass(value):
+            check_options(value, f"{prefix}{name}.")
+        elif (found := options_of(type(tree), prefix).get(f"{prefix}{name}")) is not None:
+            found.check(value)
+
+
+def _walk(tree: type, prefix: str) -> Iterator[Option]:
+    hints = get_type_hints(tree)
+    for each in fields(tree):
+        hint, may_be_null = _without_null(hints[each.name])
+        name = f"{prefix}{each.name}"
+        if is_dataclass(hint):
+            yield from _walk(hint, f"{name}.")  # type: ignore[arg-type]
+            continue
+        is_list = get_origin(hint) is list
+        kind = get_args(hint)[0] if is_list else get_origin(hint) or hint
+        declared = each.metadata.get("option", Declared())
+        yield Option(name, kind, is_list, may_be_null, _default(each), declared)
+
+
+def _plain(number: int | float) -> str:
+    return str(int(number)) if number == int(number) else f"{number:g}"
+
+
+def _without_null(hint: Any) -> tuple[Any, bool]:
+    if get_origin(hint) not in (UnionType, Union):
+        return hint, False
+    kinds = [kind for kind in get_args(hint) if kind is not type(None)]
+    return kinds[0], True
+
+
+def _default(each: "Field[Any]") -> Any:
+    if each.default_factory is not NO_DEFAULT:
+        return each.default_factory()
+    return MISSING if each.default is NO_DEFAULT else each.default
