@@ -109,7 +109,7 @@ def check_options(tree: Any, prefix: str = "") -> None:
     for name, value in vars(tree).items():
         if is_dataclass(value):
             check_options(value, f"{prefix}{name}.")
-        elif (found := options_of(type(tree), prefix).get(f"{prefix}{name}")) is not None:
+        elif (found := options_of(tree.__class__, prefix).get(f"{prefix}{name}")) is not None:
             found.check(value)
 
 
