@@ -113,9 +113,9 @@ def _complete(options: CommandOptions, run: Callable[[Any], Path | None]) -> Non
     words = io.StringIO()
     with contextlib.redirect_stdout(words):
         _compose(options, run)
-    for word in words.getvalue().splitlines():
-        if not word.endswith("_schema"):
-            print(word)
+    for line in words.getvalue().splitlines():  # one for bash, one per word for fish
+        if shown := [word for word in line.split() if not word.endswith("_schema")]:
+            print(*shown)
 
 
 def _remedy(error: OSError, output: str) -> str | None:

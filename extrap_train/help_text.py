@@ -32,6 +32,7 @@ def help_text(options: CommandOptions, own_folders: Sequence[str] = ()) -> str:
         parts.append("Tasks:\n" + _rows(options.tasks.items()))
     groups = [*options.groups, *options.file_groups]
     choices = [(f"{group}=", " | ".join(choices_of(group, own_folders))) for group in groups]
+    choices.append(("matcher@depth.matcher=", "the matcher of depth=monocular: depth.matcher.NAME"))
     parts.append("Choices:\n" + _rows(choices))
     for title, found in _sections(options):
         parts.append(f"{title}:\n" + _rows(map(_row, found)))

@@ -22,7 +22,7 @@ _FLAGS_WITH_VALUE = (
     *("--config-dir", "-cd", "--config-path", "-cp", "--config-name", "-cn"),
     *("--package", "-p", "--experimental-rerun", "--cfg", "-c", "--info", "-i"),
 )
-_WORD = re.compile(r"(?P<mark>\+{0,2}|~)(?P<key>[^=]*)(?:=(?P<value>.*))?", re.DOTALL)
+_WORD = re.compile(r"(?P<mark>~|\+{0,2})(?P<key>[^=]*)(?:=(?P<value>.*))?", re.DOTALL)
 _SWEEP = re.compile(r"(choice|range|interval|glob|shuffle|sort|tag)\(.*\)", re.DOTALL)
 """What a value of several jobs may be besides values with commas between them."""
 
