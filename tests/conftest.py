@@ -6,6 +6,7 @@ from pathlib import Path
 # One thread per worker, and per command that a test starts: the workers share the cores.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import numba
 import pytest
 import torch
 from shape_checks import check_shapes
@@ -38,6 +39,15 @@ def shared() -> Path:
     return folder
 
 
+def _use_one_thread() -> None:
+    torch.set_num_threads(1)
+    numba.set_num_threads(1)
+
+
+_use_one_thread()  # before fixtures of whole modules
+
+
 @pytest.fixture(autouse=True)
 def _one_thread() -> None:
-    torch.set_num_threads(1)
+    """Small scenes gain nothing from a second thread, and threads that wait for work cost time."""
+    _use_one_thread()

@@ -33,10 +33,10 @@ from tests.benchmarks.analytic import scene_inputs
 
 START = 150
 SMALL: dict[str, Any] = {
-    "iterations": 30,
+    "iterations": 12,
     "full_iterations": 120,
     "init_points": START,
-    "max_gaussians": 400,
+    "max_gaussians": 240,
 }
 GROWING = SMALL | {"densify_from": 0, "densify_gradient": 1e-6, "reset_first": 100}
 METHODS: dict[str, GaussianMethod] = {

@@ -12,14 +12,6 @@ from benchmarks.methods.gaussians.spherical_harmonics import sh_colors
 WIDTH, HEIGHT = 45, 38
 
 
-@pytest.fixture(autouse=True)
-def _one_numba_thread():
-    """Tiny scenes gain nothing from a second thread, and lose much on a busy machine."""
-    numba.set_num_threads(1)
-    yield
-    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
-
-
 def leaves(gaussians, pose, dtype):
     tensors = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities]
     return [x.detach().clone().to(dtype).requires_grad_() for x in (*tensors, gaussians.sh, pose)]
