@@ -8,7 +8,8 @@ from data_prep.split import by_hash
 from extrap_train.config import MethodConfig
 from extrap_train.data.sequences import Sequence
 from extrap_train.errors import InputError
-from extrap_train.trained_on import TRAINED_ON, CategoryData, TrainedOn
+from extrap_train.store.cache import read_manifest
+from extrap_train.store.manifest import MANIFEST, Split
 
 
 @dataclass(frozen=True)
@@ -18,7 +19,7 @@ class TrainedModel:
     method: str
     run: Path
     category: str
-    data: CategoryData
+    data: Split
 
     def require_unseen(self, captures: Iterable[Sequence]) -> None:
         """InputError for the first capture that the model was trained on.
@@ -46,12 +47,12 @@ def trained_models(
         if not isinstance(weights, str):
             continue
         for folder in sorted({weights.replace("{category}", c) for c in categories or [""]}):
-            record = Path(folder).resolve().parent / TRAINED_ON
-            if not record.is_file():
+            run = Path(folder).resolve().parent
+            if not (run / MANIFEST).is_file():
                 continue
             found += [
-                TrainedModel(method.name, record.parent, category, data)
-                for category, data in TrainedOn.read(record).categories.items()
+                TrainedModel(method.name, run, category, data)
+                for category, data in read_manifest(run, "restore it").split.items()
                 if data.source == "co3d"
             ]
     return found

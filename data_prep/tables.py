@@ -21,8 +21,8 @@ from extrap_train.data.frame_files import read_camera_table
 from extrap_train.data.prepared import FORMAT
 from extrap_train.data.sequences import Sequence
 from extrap_train.errors import InputError
-from extrap_train.runs import package_version
 from extrap_train.store.atomic import partial_path, write_atomic
+from extrap_train.store.manifest import package_version
 
 _PACKAGES = ("extrap-train", "numpy", "opencv-python-headless", "pyarrow", "torch")
 """Whose versions may show in what is stored."""

@@ -4,10 +4,11 @@ from pathlib import Path
 
 from extrap_train.cli import TRAIN, command
 from extrap_train.config import TrainConfig
+from extrap_train.store.outcome import Outcome
 from extrap_train.tasks import task
 
 
-def _run(config: TrainConfig) -> Path | None:
+def _run(config: TrainConfig) -> Outcome | Path | None:
     return task(config.task)(config)
 
 

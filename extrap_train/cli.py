@@ -27,6 +27,7 @@ from extrap_train.exits import ends_in_one_line
 from extrap_train.help_text import help_text
 from extrap_train.option_errors import explain
 from extrap_train.overrides import CommandLine
+from extrap_train.store.outcome import Outcome
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 """What a full disk says, wherever it is written to."""
@@ -52,7 +53,7 @@ def register_schemas() -> None:
             store.store(group=group, name=f"{name}_schema", node=variant)
 
 
-def command(options: CommandOptions, run: Callable[[Any], Path | None]) -> None:
+def command(options: CommandOptions, run: Callable[[Any], Outcome | Path | None]) -> None:
     """Compose the command's configuration with the overrides in `sys.argv` and run it.
 
     `run` may return its result's folder: a sweep takes the numbers of its `summary.json`.
@@ -76,10 +77,10 @@ def command(options: CommandOptions, run: Callable[[Any], Path | None]) -> None:
             _compose(options, run)
 
 
-def _compose(options: CommandOptions, run: Callable[[Any], Path | None]) -> None:
+def _compose(options: CommandOptions, run: Callable[[Any], Outcome | Path | None]) -> None:
     register_schemas()
 
-    def checked(config: DictConfig) -> Path | None:
+    def checked(config: DictConfig) -> Outcome | Path | None:
         output = "."
         try:
             typed = typed_config(config)
@@ -95,7 +96,7 @@ def _compose(options: CommandOptions, run: Callable[[Any], Path | None]) -> None
             raise InputError(message) from error
 
     @hydra.main(version_base="1.3", config_path="pkg://conf", config_name=options.config_name)
-    def composed(config: DictConfig) -> Path | None:
+    def composed(config: DictConfig) -> Outcome | Path | None:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             return checked(config)  # the other jobs of a sweep still run
         with ends_in_one_line():  # before Hydra adds a line of its own
@@ -108,7 +109,7 @@ def _compose(options: CommandOptions, run: Callable[[Any], Path | None]) -> None
         raise InputError(explain(error, options, sys.argv[1:])) from None
 
 
-def _complete(options: CommandOptions, run: Callable[[Any], Path | None]) -> None:
+def _complete(options: CommandOptions, run: Callable[[Any], Outcome | Path | None]) -> None:
     """Hydra's words for the shell, without the schemas, which are no choices."""
     words = io.StringIO()
     with contextlib.redirect_stdout(words):

@@ -2,10 +2,9 @@
 others join it.
 """
 
-import json
 import os
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -13,7 +12,7 @@ import torch.distributed as dist
 from lightning.pytorch.utilities import rank_zero_only
 
 from extrap_train.errors import InputError
-from extrap_train.store.atomic import write_atomic
+from extrap_train.store.records import read_record, write_record
 
 T = TypeVar("T")
 
@@ -40,6 +39,13 @@ class Opening:
     """Path of the checkpoint to resume from."""
 
 
+@dataclass(frozen=True)
+class _Announced:
+    launch: dict[str, str]
+    """What tells this launch from an earlier one."""
+    opening: Opening
+
+
 def is_first() -> bool:
     """Whether this process is the only one or the one that opens, saves and speaks for all.
 
@@ -50,8 +56,7 @@ def is_first() -> bool:
 
 def announce(folder: Path, opening: Opening) -> None:
     """Tell the other processes of this launch that the run is open."""
-    content = {"launch": _launch(), "opening": asdict(opening)}
-    write_atomic(_word(folder), json.dumps(content).encode())
+    write_record(_announcement(folder), _Announced(_launch(), opening))
 
 
 def join(folder: Path, wait_s: float = _WAIT_S) -> Opening:
@@ -60,7 +65,7 @@ def join(folder: Path, wait_s: float = _WAIT_S) -> Opening:
     Raises InputError where it has not within `wait_s`.
     """
     ends = time.monotonic() + wait_s
-    while (opening := _announced(folder)) is None:
+    while (opening := _read_announced(folder)) is None:
         if time.monotonic() >= ends:
             raise InputError(
                 f"{folder}: has not been opened by the first process of this launch in "
@@ -79,15 +84,15 @@ def gathered(value: T) -> list[T]:
     return values
 
 
-def _announced(folder: Path) -> Opening | None:
-    try:
-        content = json.loads(_word(folder).read_text())
-    except FileNotFoundError:
+def _read_announced(folder: Path) -> Opening | None:
+    file = _announcement(folder)
+    if not file.exists():
         return None
-    return Opening(**content["opening"]) if content["launch"] == _launch() else None
+    told = read_record(file, _Announced, "delete it and start the command again")
+    return told.opening if told.launch == _launch() else None
 
 
-def _word(folder: Path) -> Path:
+def _announcement(folder: Path) -> Path:
     return folder / ".opened.json"
 
 

@@ -1,28 +1,26 @@
-"""The folder of a training run: its name, its options, and whether it may be resumed."""
+"""The folder of a training run: its name, its manifest, and which run is the latest."""
 
 import hashlib
 import json
 import platform
-import shutil
-from dataclasses import MISSING, asdict, dataclass, fields
-from importlib.metadata import PackageNotFoundError, version
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 import yaml
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 
-from extrap_train.config import (
-    SceneOptions,
-    SyntheticConfig,
-    TrainConfig,
-    dotted,
-    placed,
-    placed_value,
-)
+from extrap_train.config import SceneOptions, SyntheticConfig, TrainConfig, dotted, placed
+from extrap_train.data.prepared import PreparedData
 from extrap_train.errors import InputError
-from extrap_train.store.atomic import partial_path, remove_leftovers, write_atomic
-from extrap_train.trained_on import TRAINED_ON, TrainedOn
+from extrap_train.store.atomic import partial_path, write_atomic
+from extrap_train.store.cache import REMEDY, Conflict, read_manifest, require_same
+from extrap_train.store.digests import file_digest, folder_digest
+from extrap_train.store.manifest import Manifest, Split, code_version, package_version
+from extrap_train.store.records import read_record, read_yaml
 
 _NOT_PART_OF_THE_RUN = (
     "output",
@@ -48,7 +46,7 @@ model recommends to sample with is part of the run as far as it is used, under `
 
 _LATEST = "latest"
 """Link to the newest run of a model and category."""
-_PACKAGES = ("torch", "lightning", "diffusers", "numba", "numpy", "extrap-train")
+_PACKAGES = ("torch", "lightning", "diffusers", "numba", "numpy")
 
 
 @dataclass(frozen=True)
@@ -64,18 +62,13 @@ class RunFolder:
 
     @property
     def samples(self) -> Path:
-        """Picture sheets, one a validation."""
+        """Picture sheets, one per validation."""
         return self.path / "samples"
 
     @property
     def model(self) -> Path:
         """The trained model as a diffusers folder."""
         return self.path / "model"
-
-    @property
-    def data(self) -> Path:
-        """What the run is trained on (`TrainedOn`)."""
-        return self.path / TRAINED_ON
 
     @property
     def summary(self) -> Path:
@@ -88,32 +81,56 @@ class RunFolder:
         return self.path / "config.yaml"
 
     @property
-    def lock(self) -> Path:
-        """Held by the process that trains the run; beside the folder, which may be removed."""
-        return self.path.with_name(f".{self.path.name}.lock")
-
-    @property
     def has_learnt(self) -> bool:
         """Whether there is something that other options or data would not have led to."""
         return self.summary.is_file() or self.model.exists() or any(self.checkpoints.glob("*.ckpt"))
 
 
+@dataclass(frozen=True)
+class _HowMeasured:
+    validation: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Finished:
+    """What the summary of a finished run says of it."""
+
+    steps: int
+    provenance: _HowMeasured
+
+    @classmethod
+    def read(cls, folder: RunFolder) -> "Finished":
+        """Of a run that has a summary; InputError if that is damaged."""
+        remedy = "delete it, and task=category measures the run again"
+        return read_record(folder.summary, cls, remedy)
+
+    def answers(self, config: TrainConfig) -> bool:
+        """Whether the run was trained for at least these steps and measured in this way."""
+        measured = dict(self.provenance.validation) == asdict(config.validation)
+        return self.steps >= config.trainer.steps and measured
+
+
+def in_sweep() -> bool:
+    """Whether this process runs a job of a sweep."""
+    return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+
+
 def run_identity(config: TrainConfig) -> dict[str, Any]:
     """The options that make a run what it is, by dotted key.
 
-    The data's root is one of them, but for synthetic data, which is the same wherever it lies.
+    The data's root is one of them, except for synthetic data, which is the same wherever it lies.
     """
     left_out = list(_NOT_PART_OF_THE_RUN)
     if isinstance(config.data, SyntheticConfig):
         left_out.append("data.root")
     return {
         key: value
-        for key, value in dotted(_said(config)).items()
+        for key, value in dotted(_all_options(config)).items()
         if not any(key == name or key.startswith(f"{name}.") for name in left_out)
     }
 
 
-def _said(config: TrainConfig) -> dict[str, Any]:
+def _all_options(config: TrainConfig) -> dict[str, Any]:
     """All options, with the sampler as it is used: what the model recommends is spelled out; paths
     as they lead from everywhere.
     """
@@ -125,31 +142,87 @@ def _digest(identity: dict[str, Any]) -> str:
 
 
 def run_folder(config: TrainConfig) -> RunFolder:
-    """Where the run lies or will lie; raises InputError where no folder may be called so."""
-    name = given_name(config) or f"seed{config.seed}-{_digest(run_identity(config))[:8]}"
+    """Where the run lies or will lie; raises InputError if no folder may be called so.
+
+    A sweep's jobs have folders of their own for each length and way of measuring, so that none of
+    them takes or prolongs a run of another length.
+    """
+    identity = run_identity(config)
+    if in_sweep():
+        measured = {"steps": config.trainer.steps, "validation": asdict(config.validation)}
+        identity |= dotted(measured, "sweep.")
+    name = given_name(config) or f"seed{config.seed}-{_digest(identity)[:8]}"
     return RunFolder(_runs_of(config) / name)
 
 
-def open_run(config: TrainConfig, trained_on: TrainedOn) -> RunFolder:
-    """Make or find the run's folder, with its configuration and data; for one process alone.
+def run_manifest(config: TrainConfig, prepared: list[PreparedData]) -> Manifest:
+    """What the run follows from: its options, the prepared data, and the weights it starts from."""
+    inputs, split = trained_on(config, prepared)
+    if (start := config.model.start) is not None and (path := Path(start)).exists():
+        inputs["model.start"] = folder_digest(path) if path.is_dir() else file_digest(path)
+    return Manifest.of(run_identity(config), inputs, split)
 
-    What an earlier run of that name left is removed with `resume=false`, or where it has learnt
-    nothing. Raises InputError, and changes nothing, where it was started with other options or data
-    and is to be resumed.
+
+def trained_on(
+    config: TrainConfig, prepared: list[PreparedData]
+) -> tuple[dict[str, str], dict[str, Split]]:
+    """The digests of the member categories' data, and their captures for training and testing."""
+    members = list(zip(config.category.members, prepared, strict=True))
+    inputs = {f"data of {member}": data.manifest["key"] for member, data in members}
+    inputs |= {f"held-out frames of {member}": data.manifest["split"] for member, data in members}
+    return inputs, {member: _split(data) for member, data in members}
+
+
+def _split(prepared: PreparedData) -> Split:
+    data = prepared.manifest["data"] or {}
+    train, test = (
+        tuple(
+            sorted(
+                name.split("/", 1)[1]
+                for name, role in prepared.roles.items()
+                if (role == "test") is held_out
+            )
+        )
+        for held_out in (False, True)
+    )
+    return Split(data.get("name", ""), train, test, data.get("seed"))
+
+
+def require_same_options(folder: RunFolder, config: TrainConfig) -> None:
+    """Raise Conflict if the run is to be resumed and has learnt with other options.
+
+    Asked before the data are there. In a sweep, the run must also be of exactly the job's length
+    and measured as the job asks.
     """
-    folder = run_folder(config)
-    if config.resume and folder.has_learnt:
-        require_same_options(folder, config)
-        trained_on.require_same(folder.data)
-    else:
-        _start_over(folder)
-        trained_on.write(folder.data)
-    write_atomic(folder.options, yaml.safe_dump(_said(config), sort_keys=False).encode())
-    return folder
+    if not (config.resume and folder.has_learnt):
+        return
+    before = read_manifest(folder.path)
+    require_same(folder.path, replace(before, options=_plain(run_identity(config))))
+    if folder.options.exists():
+        read_yaml(folder.options, REMEDY)  # a file that is not ours is not overwritten
+    if in_sweep() and folder.summary.is_file():
+        finished = Finished.read(folder)
+        if finished.steps != config.trainer.steps or not finished.answers(config):
+            raise Conflict(
+                f"{folder.path}: made with different trainer.steps or validation (it has "
+                f"{finished.steps} steps, the job asks for {config.trainer.steps}); {REMEDY}"
+            )
+
+
+def _plain(options: dict[str, Any]) -> dict[str, Any]:
+    plain: dict[str, Any] = json.loads(json.dumps(options))
+    return plain
+
+
+def write_options(folder: RunFolder, config: TrainConfig, *, at_least: int) -> None:
+    """Write `config.yaml`; a run that has learnt for more steps than asked stays a longer one."""
+    options = _all_options(config)
+    options["trainer"]["steps"] = max(config.trainer.steps, at_least)
+    write_atomic(folder.options, yaml.safe_dump(options, sort_keys=False).encode())
 
 
 def existing_run(config: TrainConfig) -> RunFolder:
-    """The finished run that `run` names, by default the newest; InputError where there is none."""
+    """The finished run that `run` names, by default the latest; InputError if there is none."""
     name = given_name(config)
     folder = RunFolder(_runs_of(config) / name) if name else newest_run(config)
     if not folder.summary.is_file():
@@ -158,12 +231,12 @@ def existing_run(config: TrainConfig) -> RunFolder:
 
 
 def newest_run(config: TrainConfig) -> RunFolder:
-    """Where the category's newest run is, if there is one."""
+    """Where the category's latest run is, if there is one."""
     return RunFolder(_runs_of(config) / _LATEST)
 
 
 def given_name(config: TrainConfig) -> str | None:
-    """`run`, if that can be a folder among the runs and is not the link to the newest."""
+    """`run`, if that can be a folder among the runs and is not the link to the latest."""
     name = config.run
     if name and (name in (".", "..", _LATEST) or {"/", "\\", "\0"} & set(name)):
         raise InputError(f"run={name!r}: must be the name of a folder, other than {_LATEST}")
@@ -174,61 +247,10 @@ def _runs_of(config: TrainConfig) -> Path:
     return Path(config.output) / "train" / config.category.name / config.model.name
 
 
-def _start_over(folder: RunFolder) -> None:
-    """Remove the run at once: killed meanwhile, nothing of it is taken for the new one's."""
-    remove_leftovers(folder.path.parent)
-    if folder.path.exists():
-        removed = partial_path(folder.path)
-        folder.path.rename(removed)
-        shutil.rmtree(removed)
-
-
-def require_same_options(folder: RunFolder, config: TrainConfig) -> None:
-    """InputError where the run is to be resumed and has learnt with other options.
-
-    Options that the run's version did not have yet had their default.
-    """
-    saved = folder.options
-    if not (config.resume and folder.has_learnt and saved.is_file()):
-        return
-    try:
-        before = dotted(yaml.safe_load(saved.read_text()))
-    except (yaml.YAMLError, UnicodeDecodeError, AttributeError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(
-            f"{saved}: unreadable ({reason}); remove the run or choose run=NAME"
-        ) from None
-    changed = [
-        f"{key} (was {was}, now {value})"
-        for key, value in run_identity(config).items()
-        if (was := _before(before, key, config)) != value
-    ]
-    if changed:
-        raise InputError(
-            f"{saved.parent}: started with other options: {', '.join(changed)}; "
-            "give them back their values, or choose another run=NAME, or resume=false to start over"
-        )
-
-
-def _before(options: dict[str, Any], key: str, config: TrainConfig) -> Any:
-    """An option's value among a saved run's, or its default where it is newer than the run."""
-    value = options[key] if key in options else _default(config, key)
-    return placed_value(key.rpartition(".")[2], value)
-
-
-def _default(config: Any, key: str) -> Any:
-    """What the dataclass that holds the option starts it with."""
-    if key.startswith("sampler."):
-        key = f"model.{key}"  # whose default is a value; the command's is to say nothing
-    *parents, name = key.split(".")
-    for parent in parents:
-        config = getattr(config, parent)
-    option = next(field for field in fields(config) if field.name == name)
-    return option.default if option.default_factory is MISSING else option.default_factory()
-
-
 def point_latest(folder: RunFolder) -> None:
-    """Let `latest` mean this run: once its data are known to be usable."""
+    """Let `latest` mean this run, unless a sweep made it: its last job is not its best."""
+    if in_sweep():
+        return
     link = folder.path.with_name(_LATEST)
     temporary = partial_path(link)
     temporary.unlink(missing_ok=True)
@@ -246,13 +268,6 @@ def provenance(config: TrainConfig, data_hashes: dict[str, str]) -> dict[str, An
         "device": torch.cuda.get_device_name() if torch.cuda.is_available() else platform.machine(),
         "threads": torch.get_num_threads(),
         "python": platform.python_version(),
+        "code": code_version(),
         "versions": {name: package_version(name) for name in _PACKAGES},
     }
-
-
-def package_version(name: str) -> str | None:
-    """Of an installed package; None where it is not installed."""
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None

@@ -1,17 +1,18 @@
-"""What `-m` leaves behind: `sweep.csv`, a row a job, and the same as a picture; of jobs that differ
-in `seed` alone the means, in `seeds.md`.
+"""What `-m` leaves behind: `sweep.csv`, one row per job, and the same as a picture; of jobs that
+differ in `seed` alone the means, in `seeds.md`.
 
 A Hydra callback (`hydra.callbacks` in conf/train.yaml). The table is written after every job, so
 that a sweep that is killed has the rows of what it finished, and a job that fails is a row like
-another: Hydra goes on with the others and ends with that job's error.
+another: Hydra goes on with the others and ends with that job's error. A folder holds one sweep.
 """
 
 import csv
 import io
-import json
 import math
+import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,15 +22,24 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
+from extrap_train.data.json_files import read_json
 from extrap_train.errors import InputError, did_you_mean
-from extrap_train.store.atomic import write_atomic
+from extrap_train.store.atomic import file_lock, remove_leftovers, write_atomic
+from extrap_train.store.cache import require_same
+from extrap_train.store.manifest import MANIFEST, Manifest
+from extrap_train.store.outcome import Outcome
+from extrap_train.store.records import write_record
 from extrap_train.sweep_seeds import over_seeds
 
 Row = dict[str, str]
 METRIC = "result."
+_TABLE = "sweep.csv"
 _ONLY = "every job"
 """Before the names of metrics, which could be those of options."""
-_HEAD, _LAST = ("job", "status", "seconds"), "reason"
+_HEAD, _TAIL = ("job", "status", "seconds"), ("folder", "reason")
+_NO_OPTIONS = (*_HEAD, *_TAIL)
+OK, REUSED, FAILED = "ok", "reused", "failed"
+_DONE = (OK, REUSED)
 _NO_METRICS = ("provenance", "seconds", "asked")
 """Parts of a summary that are not measured of its result."""
 _PANELS = 4
@@ -46,6 +56,27 @@ class SweepTable(Callback):
     def __init__(self, objective: str | None = None) -> None:
         self.objective = objective
 
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        """Hold the sweep's folder for this command alone; end it where another sweep lies there."""
+        folder = Path(config.hydra.sweep.dir)
+        taken = (
+            f"{folder}: another sweep is writing here; wait for it or give another hydra.sweep.dir"
+        )
+        with _ended_in_one_line(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            self._held = ExitStack()
+            self._held.enter_context(file_lock(folder / ".sweep.lock", taken))
+            remove_leftovers(folder)
+            manifest = Manifest.of({"overrides": list(config.hydra.overrides.task)})
+            if (folder / MANIFEST).exists() or (folder / _TABLE).exists():
+                require_same(folder, manifest, "give another hydra.sweep.dir")
+            else:
+                write_record(folder / MANIFEST, manifest)
+
+    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
+        """Hydra's hook."""
+        self._held.close()
+
     def on_job_start(self, config: DictConfig, **_: Any) -> None:
         """Hydra's hook."""
         self._started = time.perf_counter()
@@ -55,17 +86,32 @@ class SweepTable(Callback):
         if config.hydra.mode != RunMode.MULTIRUN:
             return
         seconds = time.perf_counter() - self._started
-        number = int(config.hydra.job.num)
-        row = row_of(number, seconds, job_return)
-        if self.objective is not None and job_return.status is JobStatus.COMPLETED:
-            _give_objective(job_return, row, self.objective)
-            row |= {"status": _status(job_return), _LAST: _reason(job_return)}
         folder = Path(config.hydra.sweep.dir)
-        rows = add_row(folder / "sweep.csv", row)
-        draw(rows, folder / "sweep.png")
-        compare_over_seeds(rows, folder / "seeds.md")
-        print(f"job {row['job']}: {row['status']} {row[_LAST]}".rstrip())
-        print(f"sweep: {folder / 'sweep.csv'}", flush=True)
+        with _ended_in_one_line(folder):
+            row = row_of(int(config.hydra.job.num), seconds, job_return)
+            if self.objective is not None and job_return.status is JobStatus.COMPLETED:
+                _give_objective(job_return, row, self.objective)
+            rows = add_row(folder / _TABLE, row)
+            draw(rows, folder / "sweep.png")
+            compare_over_seeds(rows, folder / "seeds.md")
+        numbers = [
+            f"{name.removeprefix(METRIC)} {float(row[name]):.4g}" for name in _shown_metrics([row])
+        ]
+        said = ", ".join(numbers) or row["reason"]
+        print(f"job {row['job']}: {row['status']} {said}".rstrip())
+        print(f"sweep: {folder / _TABLE}", flush=True)
+
+
+@contextmanager
+def _ended_in_one_line(folder: Path) -> Iterator[None]:
+    """Hydra makes a warning of what a callback raises, and goes on without a table."""
+    try:
+        yield
+    except InputError as error:
+        sys.exit(f"error: {error}")
+    except OSError as error:
+        place = error.filename or folder
+        sys.exit(f"error: {place}: {error.strerror}; give another hydra.sweep.dir")
 
 
 def row_of(number: int, seconds: float, job: JobReturn) -> Row:
@@ -73,29 +119,22 @@ def row_of(number: int, seconds: float, job: JobReturn) -> Row:
 
     The metrics are those of `summary.json` in the folder that the task returned.
     """
+    # Asked for in public, the value of a job that failed is raised and printed.
     value = job._return_value
+    outcome = value if isinstance(value, Outcome) else None
+    folder = outcome.folder if outcome else value if isinstance(value, Path) else None
     overrides = dict(word.lstrip("+~").partition("=")[::2] for word in job.overrides or ())
-    metrics = metrics_at(value) if isinstance(value, Path) else {}
+    failed = job.status is not JobStatus.COMPLETED
+    reason = f"{type(value).__name__}: {' '.join(str(value).split())}" if failed else ""
     return {
         "job": str(number),
-        "status": _status(job),
+        "status": FAILED if failed else REUSED if outcome and outcome.is_reused else OK,
         "seconds": f"{seconds:.1f}",
         **overrides,
-        **{METRIC + name: repr(number) for name, number in metrics.items()},
-        _LAST: _reason(job),
+        **{METRIC + name: repr(x) for name, x in (metrics_at(folder) if folder else {}).items()},
+        "folder": str(folder or ""),
+        "reason": reason,
     }
-
-
-def _status(job: JobReturn) -> str:
-    return "ok" if job.status is JobStatus.COMPLETED else "failed"
-
-
-def _reason(job: JobReturn) -> str:
-    # Asked for in public, the value of a job that failed is raised and printed.
-    error = job._return_value
-    if job.status is JobStatus.COMPLETED:
-        return ""
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
 def _give_objective(job: JobReturn, row: Row, objective: str) -> None:
@@ -106,10 +145,12 @@ def _give_objective(job: JobReturn, row: Row, objective: str) -> None:
         return
     known = [name.removeprefix(METRIC) for name in row if name.startswith(METRIC)]
     job.status = JobStatus.FAILED
-    job.return_value = InputError(
+    error = InputError(
         f"hydra.callbacks.sweep_table.objective={objective}: the job has no such metric; "
         f"{did_you_mean(objective, known)}"
     )
+    job.return_value = error
+    row |= {"status": FAILED, "reason": f"{type(error).__name__}: {error}"}
 
 
 def metrics_at(folder: Path) -> dict[str, float]:
@@ -117,7 +158,7 @@ def metrics_at(folder: Path) -> dict[str, float]:
     file = folder / "summary.json"
     if not file.is_file():
         return {}
-    summary = json.loads(file.read_text())
+    summary = read_json(file)
     return dict(_numbers({k: v for k, v in summary.items() if k not in _NO_METRICS}))
 
 
@@ -140,9 +181,9 @@ def add_row(file: Path, row: Row) -> list[Row]:
     with FileLock(file.with_suffix(".lock")):  # a launcher may run jobs side by side
         rows = [r for r in read_rows(file) if r["job"] != row["job"]]
         rows = sorted([*rows, row], key=lambda r: int(r["job"]))
-        names = [name for r in rows for name in r if name not in (*_HEAD, _LAST)]
+        names = [name for r in rows for name in r if name not in _NO_OPTIONS]
         text = io.StringIO()
-        table = csv.DictWriter(text, [*_HEAD, *dict.fromkeys(names), _LAST], restval="")
+        table = csv.DictWriter(text, [*_HEAD, *dict.fromkeys(names), *_TAIL], restval="")
         table.writeheader()
         table.writerows(rows)
         write_atomic(file, text.getvalue().encode())
@@ -155,14 +196,14 @@ def read_rows(file: Path) -> list[Row]:
         return []
     with file.open(newline="") as content:
         return [
-            {k: v for k, v in row.items() if v or k in (*_HEAD, _LAST)}
+            {k: v for k, v in row.items() if v or k in _NO_OPTIONS}
             for row in csv.DictReader(content)
         ]
 
 
 def draw(rows: list[Row], file: Path) -> None:
-    """A panel a metric, a bar a finished job, named by the overrides that differ."""
-    done = [row for row in rows if row["status"] == "ok"]
+    """One panel per metric with a bar per finished job, named by the overrides that differ."""
+    done = [row for row in rows if row["status"] in _DONE]
     metrics = _shown_metrics(done)
     if not metrics:
         return
@@ -194,11 +235,11 @@ def compare_over_seeds(rows: list[Row], file: Path) -> None:
     rows = [row for row in rows if "seed" in row]
     if not rows:
         return
-    done = [row for row in rows if row["status"] == "ok"]
+    done = [row for row in rows if row["status"] in _DONE]
     metrics = _shown_metrics(done)
     alike = [{**row, "seed": ""} for row in rows]
     first = _label(alike[0], alike) or _ONLY
-    labels = [_label(row, alike) or _ONLY for row in alike if row["status"] == "ok"]
+    labels = [_label(row, alike) or _ONLY for row in alike if row["status"] in _DONE]
     if len(set(labels)) == len(labels) or not metrics:
         return
     columns = {
@@ -216,6 +257,6 @@ def _shown_metrics(rows: list[Row]) -> list[str]:
 
 def _label(row: Row, rows: list[Row]) -> str:
     """The overrides that tell the jobs apart."""
-    options = [n for n in row if n not in (*_HEAD, _LAST) and not n.startswith(METRIC)]
+    options = [n for n in row if n not in _NO_OPTIONS and not n.startswith(METRIC)]
     apart = [n for n in options if len({r.get(n) for r in rows}) > 1]
     return " ".join(f"{name}={row.get(name, '')}" for name in apart)

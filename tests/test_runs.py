@@ -1,6 +1,7 @@
 """The same command finds its run again; another one never writes into it unasked."""
 
-from dataclasses import replace
+import json
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,28 +17,44 @@ from extrap_train.config import (
     SamplerOptions,
     SyntheticConfig,
     TrainConfig,
+    ValidationConfig,
 )
 from extrap_train.config import DatasetDepthConfig as Depth
 from extrap_train.errors import InputError
-from extrap_train.runs import RunFolder, _runs_of, existing_run, open_run, point_latest
-from extrap_train.trained_on import CategoryData, TrainedOn
+from extrap_train.runs import (
+    Finished,
+    RunFolder,
+    _runs_of,
+    existing_run,
+    newest_run,
+    point_latest,
+    require_same_options,
+    run_folder,
+    run_identity,
+)
+from extrap_train.store.cache import Conflict, read_manifest
+from extrap_train.store.manifest import Manifest, Split
+from extrap_train.tasks.category import _opened
+from extrap_train.terminal import terminal
 
-"""Of the default run of a category, from when the last option was added that had to rename it."""
+_SPLIT = Split("synthetic", ("0001",), ("0000",))
 
 
-_DATA = TrainedOn({"hydrant": CategoryData("synthetic", "key", "split", ("0001",), ("0000",))})
-
-
-def opened(config: TrainConfig) -> RunFolder:
-    """The run, on data that stay the same."""
-    return open_run(config, _DATA)
+def opened(config: TrainConfig, key: str = "key") -> RunFolder:
+    """The run, on the data of this key, as `task=category` opens it."""
+    folder = run_folder(config)
+    require_same_options(folder, config)
+    inputs = {"data of hydrant": key}
+    manifest = Manifest.of(run_identity(config), inputs, {"hydrant": _SPLIT})
+    with _opened(folder, config, manifest, terminal(quiet=True)):
+        return folder
 
 
 def begun(config: TrainConfig) -> RunFolder:
     """The run with its first checkpoint."""
     run = opened(config)
     run.checkpoints.mkdir(exist_ok=True)
-    (run.checkpoints / "step-00000003.ckpt").touch()
+    (run.checkpoints / "step-00000003.ckpt").touch()  # damaged, and passed over
     return run
 
 
@@ -58,16 +75,16 @@ def test_the_same_options_find_the_same_folder(config: TrainConfig, tmp_path: Pa
     assert opened(config) == first
 
 
-def test_latest_moves_only_when_told(config: TrainConfig, tmp_path: Path) -> None:
-    """A run whose data turn out to be unusable leaves the link at the last good one."""
+def test_latest_is_the_run_that_was_opened_last(config: TrainConfig, tmp_path: Path) -> None:
     latest = tmp_path / "train/hydrant/small/latest"
-    first = opened(config)
+    first = run_folder(config)
     assert not latest.exists()
-    point_latest(first)
-    second = opened(replace(config, seed=1))
+    opened(config)
     assert latest.resolve() == first.path.resolve()
-    point_latest(second)
+    second = opened(replace(config, seed=1))
     assert latest.resolve() == second.path.resolve()
+    point_latest(first)
+    assert latest.resolve() == first.path.resolve()
 
 
 def test_other_options_are_another_run(config: TrainConfig) -> None:
@@ -87,18 +104,6 @@ def test_resuming_a_named_run_with_other_options_says_which(config: TrainConfig)
     opened(replace(changed, resume=False))
 
 
-def test_an_option_that_is_new_since_had_its_default(config: TrainConfig) -> None:
-    saved = begun(replace(config, run="mine")).options
-    options = yaml.safe_load(saved.read_text())
-    del options["trainer"]["min_snr"]
-    saved.write_text(yaml.safe_dump(options))
-    opened(replace(config, run="mine"))
-    saved.write_text(yaml.safe_dump(options))
-    changed = replace(config.trainer, min_snr=5.0)
-    with pytest.raises(InputError, match=r"min_snr \(was None, now 5\.0\)"):
-        opened(replace(config, run="mine", trainer=changed))
-
-
 def test_what_a_model_recommends_is_part_of_the_run_as_far_as_it_is_used(
     config: TrainConfig,
 ) -> None:
@@ -111,11 +116,19 @@ def test_what_a_model_recommends_is_part_of_the_run_as_far_as_it_is_used(
     assert yaml.safe_load((run.path / "config.yaml").read_text())["sampler"]["steps"] == 50
 
 
+_OPENED = {"config.yaml", "manifest.json", ".opened.json"}
+
+
+def _summary(steps: int) -> str:
+    measured = {"validation": asdict(ValidationConfig())}
+    return json.dumps({"steps": steps, "provenance": measured})
+
+
 def test_starting_over_leaves_nothing_of_the_run(config: TrainConfig) -> None:
     """Else a new run that is killed early would be taken for the finished old one, or would lie
-    beside its pictures and model."""
+    among its pictures and model."""
     run = begun(config)
-    run.summary.write_text("{}")
+    run.summary.write_text(_summary(config.trainer.steps))
     for part in (run.model, run.samples, run.path / "tensorboard"):
         part.mkdir()
         (part / "file").touch()
@@ -124,8 +137,9 @@ def test_starting_over_leaves_nothing_of_the_run(config: TrainConfig) -> None:
     assert run.summary.exists()
     assert (run.model / "file").exists()
     opened(replace(config, resume=False))
-    assert {path.name for path in run.path.iterdir()} == {"config.yaml", "data.json"}
-    assert [path.name for path in run.path.parent.iterdir()] == [run.path.name]
+    assert {path.name for path in run.path.iterdir()} == _OPENED
+    left = {path.name for path in run.path.parent.iterdir() if path.suffix != ".lock"}
+    assert left == {run.path.name, "latest", ".lock"}
 
 
 def test_a_run_that_has_learnt_nothing_binds_nobody(config: TrainConfig) -> None:
@@ -133,12 +147,15 @@ def test_a_run_that_has_learnt_nothing_binds_nobody(config: TrainConfig) -> None
     mine = replace(config, run="mine")
     run = opened(mine)
     (run.path / "metrics.csv").touch()
-    other = TrainedOn({"hydrant": replace(_DATA.categories["hydrant"], key="other")})
     changed = replace(mine, model=replace(config.model, learning_rate=0.5))
-    assert open_run(changed, other) == run
-    assert TrainedOn.read(run.data) == other
+    assert opened(changed, "other") == run
+    assert read_manifest(run.path).inputs == {"data of hydrant": "other"}
     assert yaml.safe_load(run.options.read_text())["model"]["learning_rate"] == 0.5
-    assert {path.name for path in run.path.iterdir()} == {"config.yaml", "data.json"}
+    assert {path.name for path in run.path.iterdir()} == _OPENED
+
+
+def _content(run: RunFolder) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
 
 
 @pytest.mark.parametrize("mark", ["checkpoints/step-00000003.ckpt", "summary.json", "model/unet"])
@@ -148,12 +165,70 @@ def test_a_run_that_has_learnt_is_not_opened_with_other_data(
     run = opened(config)
     (run.path / mark).parent.mkdir(exist_ok=True)
     (run.path / mark).touch()
-    before = {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
-    other = TrainedOn({"hydrant": replace(_DATA.categories["hydrant"], key="other")})
+    before = _content(run)
     longer = replace(config, trainer=replace(config.trainer, steps=9))
-    with pytest.raises(InputError, match="its data have changed"):
-        open_run(longer, other)
-    assert {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()} == before
+    with pytest.raises(Conflict, match="data of hydrant"):
+        opened(longer, "other")
+    assert _content(run) == before
+
+
+def _of_steps(config: TrainConfig, steps: int, run: str | None = None) -> TrainConfig:
+    return replace(config, run=run, trainer=replace(config.trainer, steps=steps))
+
+
+@pytest.mark.parametrize("steps", [1, 19, 20])
+def test_a_finished_run_is_not_rewritten_by_a_shorter_one(config: TrainConfig, steps: int) -> None:
+    run = opened(_of_steps(config, 20))
+    run.summary.write_text(_summary(20))
+    told = {run.path / ".opened.json"}
+    before = {path: content for path, content in _content(run).items() if path not in told}
+    opened(_of_steps(config, steps))
+    assert {path: content for path, content in _content(run).items() if path not in told} == before
+
+
+def test_a_finished_run_without_checkpoints_is_not_replaced_by_a_shorter_one(
+    config: TrainConfig,
+) -> None:
+    run = opened(_of_steps(config, 20))
+    run.summary.write_text(_summary(20))
+    before = _content(run)
+    otherwise = replace(config, validation=replace(config.validation, examples=3))
+    with pytest.raises(Conflict, match=r"trainer\.steps \(was 20, now 9\)"):
+        opened(_of_steps(otherwise, 9))
+    assert _content(run) == before
+
+
+@pytest.fixture
+def _sweeping(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("extrap_train.runs.in_sweep", lambda: True)
+
+
+@pytest.mark.usefixtures("_sweeping")
+def test_a_sweeps_jobs_have_runs_of_exactly_their_options(config: TrainConfig) -> None:
+    measured = replace(config, validation=replace(config.validation, examples=3))
+    jobs = [_of_steps(config, 20), _of_steps(config, 30), measured, replace(config, seed=1)]
+    assert len({opened(job).path for job in jobs}) == 4
+    assert opened(jobs[0]) == opened(jobs[0])
+    assert not newest_run(config).path.exists(), "latest is never a sweep's job"
+
+
+@pytest.mark.usefixtures("_sweeping")
+@pytest.mark.parametrize("steps", [19, 21, 1240])
+def test_a_sweeps_job_takes_no_named_run_of_another_length(config: TrainConfig, steps: int) -> None:
+    run = opened(_of_steps(config, 20, "mine"))
+    run.summary.write_text(_summary(steps))
+    before = _content(run)
+    with pytest.raises(Conflict, match=rf"trainer\.steps .*{steps}"):
+        opened(_of_steps(config, 20, "mine"))
+    assert _content(run) == before
+
+
+def test_a_single_command_does_not_share_a_sweeps_run(
+    config: TrainConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alone = opened(config)
+    monkeypatch.setattr("extrap_train.runs.in_sweep", lambda: True)
+    assert opened(config) != alone
 
 
 def test_another_download_is_another_run(config: TrainConfig) -> None:
@@ -177,8 +252,6 @@ def test_the_same_download_is_the_same_run_however_its_path_is_spelled(
         assert len(runs) == 1
     saved = runs.pop() / "config.yaml"
     assert yaml.safe_load(saved.read_text())["data"]["root"] == str(tmp_path / "co3d")
-    saved.write_text(saved.read_text().replace(str(tmp_path / "co3d"), "link/"))  # by an older one
-    opened(replace(config, run="mine", data=Co3dConfig(root="co3d")))
 
 
 def test_a_start_is_a_path_where_there_is_one(
@@ -224,11 +297,58 @@ def test_a_run_has_the_name_of_a_folder(config: TrainConfig, name: str) -> None:
     assert precious.exists()
 
 
-def test_options_that_are_no_text_are_one_line(config: TrainConfig) -> None:
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"\xff\xfe\xfa",
+        b"a: &a [*a]",
+        b"a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]",
+        b"[" * 20_000,
+        b"- a",
+        b"a: 1\n" * 90_000,
+    ],
+)
+def test_options_that_are_no_options_are_one_line(config: TrainConfig, content: bytes) -> None:
     saved = begun(replace(config, run="mine")).options
-    saved.write_bytes(b"\xff\xfe\xfa")
-    with pytest.raises(InputError, match=r"unreadable.*choose run=NAME"):
+    saved.write_bytes(content)
+    with pytest.raises(InputError, match=r"config\.yaml: unreadable .*run=NAME"):
         opened(replace(config, run="mine"))
+    assert saved.read_bytes() == content
+
+
+def test_a_run_answers_for_fewer_steps_measured_alike(config: TrainConfig, tmp_path: Path) -> None:
+    run = RunFolder(tmp_path)
+    run.summary.write_text(_summary(20))
+    finished = Finished.read(run)
+    assert finished.steps == 20
+    assert finished.answers(_of_steps(config, 10))
+    assert finished.answers(_of_steps(config, 20))
+    assert not finished.answers(_of_steps(config, 21))
+    otherwise = replace(config, validation=replace(config.validation, examples=3))
+    assert not finished.answers(_of_steps(otherwise, 10))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b'{"steps": 2',
+        b"[]",
+        b"3",
+        b"\xff\xfe",
+        b'{"steps": 20}',
+        b'{"steps": []}',
+        b'{"steps": true, "provenance": {"validation": {}}}',
+        b"[" * 20_000,
+        b'{"provenance":' * 9_000,
+    ],
+)
+def test_a_damaged_summary_is_one_line(content: bytes, tmp_path: Path) -> None:
+    run = RunFolder(tmp_path)
+    run.summary.write_bytes(content)
+    with pytest.raises(InputError, match=r"summary\.json: .*; delete it") as refused:
+        Finished.read(run)
+    assert "\n" not in str(refused.value)
 
 
 def test_a_set_list_makes_another_run(config: TrainConfig) -> None:

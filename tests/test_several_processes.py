@@ -113,6 +113,15 @@ def test_the_others_join_the_launch_that_opened_the_run(
         join(tmp_path, wait_s=0.0)
 
 
+@pytest.mark.parametrize(
+    "content", [b"", b"[" * 20_000, b'{"launch": {}}', b'{"launch": 3, "opening": {}}', b"\xff"]
+)
+def test_a_damaged_announcement_is_one_line(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / ".opened.json").write_bytes(content)
+    with pytest.raises(InputError, match=r"opened\.json"):
+        join(tmp_path, wait_s=0.0)
+
+
 def test_the_job_of_a_sweep_trains_on_one_device(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its other processes would be started with the whole sweep's command."""
     monkeypatch.setattr(

@@ -12,13 +12,15 @@ import yaml
 from extrap_train.__main__ import main
 from extrap_train.config import TrainConfig
 from extrap_train.errors import InputError
+from extrap_train.store.atomic import file_lock
+from extrap_train.store.outcome import Outcome
 from extrap_train.sweep import add_row, compare_over_seeds, read_rows
 from extrap_train.sweep_seeds import over_seeds
 
-Fake = Callable[[TrainConfig], Path]
+Fake = Callable[[TrainConfig], Path | Outcome]
 
 
-def _trained(tmp_path: Path) -> Fake:
+def _trained(tmp_path: Path) -> Callable[[TrainConfig], Path]:
     """A task that has learnt as much as it was given steps, and never any cups."""
 
     def run(config: TrainConfig) -> Path:
@@ -54,7 +56,7 @@ def test_every_job_is_a_row_with_its_overrides_and_metrics(
     table = pd.read_csv(tmp_path / "sweep" / "sweep.csv")
     assert list(table.columns) == [
         "job", "status", "seconds", "category", "trainer.steps", "model.weight_decay",
-        "result.validation.model.psnr", "result.validation.nearest.psnr", "reason",
+        "result.validation.model.psnr", "result.validation.nearest.psnr", "folder", "reason",
     ]  # fmt: skip
     assert list(table["category"]) == ["apple", "apple", "book", "book"]
     assert list(table["result.validation.model.psnr"]) == [21.0, 22.0, 21.0, 22.0]
@@ -126,7 +128,8 @@ def test_a_row_that_comes_late_or_twice_has_its_place(tmp_path: Path) -> None:
     file = tmp_path / "sweep.csv"
     for number, lr in (("10", "3"), ("2", "1"), ("10", "4")):
         rows = add_row(
-            file, {"job": number, "status": "ok", "seconds": "1.0", "lr": lr, "reason": ""}
+            file,
+            {"job": number, "status": "ok", "seconds": "1.0", "lr": lr, "folder": "", "reason": ""},
         )
     assert [(row["job"], row["lr"]) for row in rows] == [("2", "1"), ("10", "4")]
     assert read_rows(file) == rows
@@ -138,6 +141,88 @@ def test_a_single_run_has_no_table(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     monkeypatch.setattr(sys, "argv", ["extrap_train", "category=apple"])
     main()
     assert not list(tmp_path.rglob("sweep.csv"))
+
+
+def test_a_job_that_takes_a_finished_run_says_so(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    train = _trained(tmp_path)
+
+    def taken(config: TrainConfig) -> Outcome:
+        return Outcome(train(config), is_reused=config.seed == 1)
+
+    words = ["category=apple", "seed=0,1,2"]
+    assert _sweep(monkeypatch, taken, tmp_path / "sweep", *words) is None
+    table = pd.read_csv(tmp_path / "sweep" / "sweep.csv")
+    assert list(table["status"]) == ["ok", "reused", "ok"]
+    assert table["result.validation.model.psnr"].notna().all()
+    assert all(Path(folder).is_dir() for folder in table["folder"])
+    assert "job 1: reused validation.model.psnr" in capfd.readouterr().out
+    assert "| 3 |" in (tmp_path / "sweep" / "seeds.md").read_text()
+
+
+def _lines(said: str | None) -> int:
+    return len((said or "").splitlines())
+
+
+def test_two_sweeps_at_once_in_one_folder_are_one_too_many(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    with file_lock(tmp_path / ".sweep.lock", "held by this test"):
+        said = _sweep(monkeypatch, _trained(tmp_path), tmp_path, "category=apple")
+    assert "another sweep" in (said or "")
+    assert _lines(said) == 1
+    assert not (tmp_path / "sweep.csv").exists()
+    assert _sweep(monkeypatch, _trained(tmp_path), tmp_path, "category=apple") is None
+
+
+@pytest.mark.parametrize("other", [["seed=0,1,2"], ["seed=1,0"], ["trainer.steps=3,4"]])
+def test_another_sweep_does_not_mix_its_rows_with_those_that_lie_there(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, other: list[str]
+) -> None:
+    train, folder = _trained(tmp_path), tmp_path / "sweep"
+    assert _sweep(monkeypatch, train, folder, "category=apple", "seed=0,1") is None
+    before = (folder / "sweep.csv").read_bytes()
+    said = _sweep(monkeypatch, train, folder, "category=apple", *other)
+    assert "hydra.sweep.dir" in (said or "")
+    assert _lines(said) == 1
+    assert (folder / "sweep.csv").read_bytes() == before
+    assert _sweep(monkeypatch, train, folder, "category=apple", "seed=0,1") is None
+
+
+@pytest.mark.parametrize("content", ["", "[" * 20_000, "{}"])
+def test_a_folder_with_a_damaged_manifest_is_refused(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, content: str
+) -> None:
+    (tmp_path / "manifest.json").write_text(content)
+    said = _sweep(monkeypatch, _trained(tmp_path), tmp_path, "category=apple")
+    assert "manifest.json" in (said or "")
+    assert _lines(said) == 1
+
+
+@pytest.mark.parametrize("error", [PermissionError(13, "Permission denied"), OSError(28, "full")])
+@pytest.mark.parametrize("where", ["file_lock", "add_row"])
+def test_a_sweep_that_cannot_write_its_table_ends_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, error: OSError, where: str
+) -> None:
+    def refuse(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(f"extrap_train.sweep.{where}", refuse)
+    said = _sweep(monkeypatch, _trained(tmp_path), tmp_path / "sweep", "category=apple")
+    assert "hydra.sweep.dir" in (said or "")
+    assert _lines(said) == 1
+
+
+def test_a_full_disk_in_a_job_is_its_row(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def full(config: TrainConfig) -> Path:
+        raise OSError(28, "No space left on device", str(tmp_path))
+
+    said = _sweep(monkeypatch, full, tmp_path / "sweep", "category=apple", "seed=0,1")
+    assert "No space left" in (said or "")
+    assert _lines(said) == 1
+    table = pd.read_csv(tmp_path / "sweep" / "sweep.csv")
+    assert list(table["status"]) == ["failed", "failed"]
 
 
 def test_a_sweeper_is_told_the_objective(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -148,12 +148,13 @@ class PairModule(lightning.LightningDataModule):
         self.chosen = spread(len(validation), validation_examples)
 
     def train_dataloader(self) -> DataLoader[PairBatch]:
-        """One epoch: the batches between two checkpoints."""
+        """The batches up to the next checkpoint, at a multiple of `batches_per_epoch` steps."""
         trainer = self.trainer
+        done = trainer.global_step if trainer else 0
         sampler = PositionSampler(
             len(self.train),
             self.batch_size,
-            self.batches_per_epoch,
+            self.batches_per_epoch - done % self.batches_per_epoch,
             self.seed,
             steps_done=lambda: trainer.global_step if trainer else 0,
             rank=trainer.global_rank if trainer else 0,

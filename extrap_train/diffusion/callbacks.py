@@ -1,115 +1,22 @@
-"""How a run survives: whole checkpoints, a metrics table that knows its step, averaged weights, a
-progress bar.
-"""
+"""What a training run shows on its way: averaged weights, a table of metrics, a progress bar."""
 
 import csv
 import io
-import os
-import pickle
+import math
 from collections.abc import Mapping
-from contextlib import suppress
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-import torch
 from lightning import LightningModule, Trainer
-from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch.callbacks import Callback, WeightAveraging
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities import rank_zero_only
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from torch import Tensor
 
 from extrap_train.errors import InputError
-from extrap_train.store.atomic import partial_path, replace_synced, write_atomic
-
-_KEPT = 2
-
-
-class WholeCheckpointIO(TorchCheckpointIO):
-    """Writes a checkpoint complete or not at all, and loads it without running any code from it."""
-
-    def save_checkpoint(
-        self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: Any = None
-    ) -> None:
-        """Write under a temporary name, then rename what has reached the disk."""
-        path = Path(path)
-        temporary = partial_path(path)
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            torch.save(checkpoint, temporary)  # not by way of memory: it is 14 GB at full size
-            replace_synced(temporary, path)
-        except (OSError, RuntimeError) as error:
-            reason = str(error).splitlines()[0]
-            raise InputError(
-                f"{path}: cannot be written ({reason}); free space or choose another output="
-            ) from None
-        finally:
-            with suppress(OSError):  # the folder itself may be what cannot be written
-                temporary.unlink(missing_ok=True)
-
-    def load_checkpoint(
-        self,
-        path: str | os.PathLike[str],
-        map_location: Any = lambda storage, location: storage,
-        weights_only: bool | None = True,
-    ) -> dict[str, Any]:
-        """Load tensors and plain values only; InputError where the file holds anything else."""
-        try:
-            return torch.load(path, map_location=map_location, weights_only=True)
-        except (RuntimeError, OSError, EOFError, pickle.UnpicklingError) as error:
-            reason = f"{type(error).__name__} {error}".splitlines()[0]
-            raise InputError(
-                f"{path}: cannot be resumed from ({reason}); delete it to resume from the "
-                "checkpoint before it"
-            ) from None
-
-
-class EpochCheckpoints(Callback):
-    """Saves at the end of every epoch and keeps the newest two.
-
-    Epochs are as long as the distance between checkpoints, so that a resumed run starts at the
-    first batch of an epoch and sees exactly the batches that it would have seen.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-
-    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Save, then drop what is older."""
-        trainer.save_checkpoint(self.folder / f"step-{trainer.global_step:08d}.ckpt")
-        if trainer.is_global_zero:
-            for old in checkpoints(self.folder)[:-_KEPT]:
-                old.unlink()
-
-    def on_load_checkpoint(
-        self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
-    ) -> None:
-        """Say that the saved epoch was over.
-
-        Lightning counts an epoch as unfinished while its end's callbacks run; resumed with a limit
-        of steps, it would insert an epoch of a single batch.
-        """
-        progress = checkpoint["loops"]["fit_loop"]
-        for span in ("total", "current"):
-            epoch = progress["epoch_progress"][span]
-            epoch["completed"] = epoch["processed"]
-        batches = progress["epoch_loop.batch_progress"]
-        batches["current"] = dict.fromkeys(batches["current"], 0)
-        batches["is_last_batch"] = False
-
-
-def checkpoints(folder: Path) -> list[Path]:
-    """Complete checkpoints, oldest first."""
-    return sorted(folder.glob("step-*.ckpt"))
+from extrap_train.store.atomic import write_atomic
+from extrap_train.terminal import progress
 
 
 class AveragedWeights(WeightAveraging):
@@ -130,7 +37,10 @@ class AveragedWeights(WeightAveraging):
 
 
 class MetricsTable(Logger):
-    """`metrics.csv`: a row per logged step; a resumed run drops the rows behind its checkpoint."""
+    """`metrics.csv`: a row per logged step; a resumed run drops the rows behind its checkpoint.
+
+    Lightning's CSVLogger removes the earlier table of a run that resumes.
+    """
 
     def __init__(self, path: Path, resumed_step: int) -> None:
         super().__init__()
@@ -172,8 +82,19 @@ class MetricsTable(Logger):
 def _read(path: Path) -> list[dict[str, str]]:
     if not path.is_file():
         return []
-    with path.open(newline="") as file:
-        return [{k: v for k, v in row.items() if v} for row in csv.DictReader(file)]
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = [{k: v for k, v in row.items() if k and v} for row in csv.DictReader(file)]
+        for row in rows:
+            for value in row.values():
+                float(value)
+            int(row["step"])
+    except (csv.Error, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{path}: damaged ({type(error).__name__} {error}); delete it to go on without the "
+            "rows of earlier steps"
+        ) from None
+    return rows
 
 
 class StepProgress(Callback):
@@ -181,43 +102,29 @@ class StepProgress(Callback):
 
     def __init__(self, steps: int) -> None:
         self.steps = steps
-        self._bar: Progress | None = None
-        self._task = TaskID(0)
+        self._open = ExitStack()
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Open the bar at the step that the run resumes from."""
-        self._bar = Progress(
-            TextColumn("train"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[note]}"),
-            disable=not trainer.is_global_zero,
+        bar = progress(
+            "train", self.steps, "steps", done=trainer.global_step, shown=trainer.is_global_zero
         )
-        self._bar.start()
-        self._task = self._bar.add_task(
-            "train", total=self.steps, completed=trainer.global_step, note=""
-        )
+        self._bar = self._open.enter_context(bar)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Advance, and stop with a clear word where the loss is no number any more."""
+        """Advance, and stop with a clear word if the loss is no number any more."""
         loss = float(trainer.callback_metrics["loss"])
-        if not loss == loss:
+        if not math.isfinite(loss):
             raise InputError(
                 f"the loss is not a number at step {trainer.global_step}: lower "
                 "model.learning_rate or set trainer.precision=32-true under another run=NAME"
             )
-        note = f"loss {loss:.4f}"
         above = trainer.callback_metrics.get("validation/above_baselines_db")
-        if above is not None:
-            note += f", {float(above):+.2f} dB against the best baseline"
-        assert self._bar is not None
-        self._bar.update(self._task, completed=trainer.global_step, note=note)
+        note = f"loss {loss:.4f}" + (f", {float(above):+.2f} dB" if above is not None else "")
+        self._bar.reach(trainer.global_step, note)
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Close the bar, also after an error."""
-        if self._bar is not None:
-            self._bar.stop()
+        self._open.close()

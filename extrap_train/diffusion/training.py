@@ -22,6 +22,7 @@ from extrap_train.diffusion.evaluation import (
 )
 from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.errors import InputError
 from extrap_train.metrics import Distance
 from extrap_train.processes import gathered
 from extrap_train.views import PairBatch
@@ -71,7 +72,13 @@ class CategoryTraining(lightning.LightningModule):
         of_all = len(self.validation_names)
         index = shared_out(of_all, self.global_rank, self.trainer.world_size)[batch_idx]
         named = [(batch, self.validation_names[index])]
-        self.predictions[index] = next(predict(self.model, named, self.sampler, self.config.seed))
+        made = next(predict(self.model, named, self.sampler, self.config.seed))
+        if not made.images["model"].isfinite().all():
+            raise InputError(
+                f"step {self.global_step}: sampled views hold values that are not numbers: lower "
+                "model.learning_rate, or sample with other options under sampler"
+            )
+        self.predictions[index] = made
 
     def on_validation_epoch_start(self) -> None:
         """Forget the last validation's pictures."""

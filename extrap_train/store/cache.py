@@ -62,11 +62,11 @@ def claim(folder: Path, manifest: Manifest, *, resume: bool) -> Iterator[Claim]:
         yield Claim(folder, manifest, is_reused)
 
 
-def require_same(folder: Path, manifest: Manifest) -> None:
+def require_same(folder: Path, manifest: Manifest, remedy: str = REMEDY) -> None:
     """Raise `Conflict` unless the result in a folder was made from the same."""
-    before = read_manifest(folder)
+    before = read_manifest(folder, remedy)
     if differences := manifest.differences(before):
-        raise Conflict(f"{folder}: made with different {', '.join(differences)}; {REMEDY}")
+        raise Conflict(f"{folder}: made with different {', '.join(differences)}; {remedy}")
 
 
 def read_manifest(folder: Path, remedy: str = REMEDY) -> Manifest:

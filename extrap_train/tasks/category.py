@@ -12,43 +12,49 @@ from typing import Any, cast
 import lightning
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
+from rich.console import Console
 
 from extrap_train.config import TrainConfig, placed
 from extrap_train.data.module import PairModule
 from extrap_train.data.prepared import PreparedData
 from extrap_train.device import require_accelerator
-from extrap_train.diffusion.callbacks import (
-    AveragedWeights,
-    EpochCheckpoints,
-    MetricsTable,
-    StepProgress,
-    WholeCheckpointIO,
-    checkpoints,
-)
+from extrap_train.diffusion.callbacks import AveragedWeights, MetricsTable, StepProgress
 from extrap_train.diffusion.checkpoint import initial_model, save_model
 from extrap_train.diffusion.layout import arranged
 from extrap_train.diffusion.memory import advice_where_memory_ends, training_memory
 from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.resume import (
+    Checkpoints,
+    WholeCheckpointIO,
+    newest_intact,
+    restoring,
+    step_of,
+    thin_checkpoints,
+)
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.metrics import lpips_or_reason
 from extrap_train.processes import Opening, announce, is_first, join
 from extrap_train.runs import (
+    Finished,
     RunFolder,
-    open_run,
+    in_sweep,
     point_latest,
     provenance,
     require_same_options,
     run_folder,
+    run_manifest,
+    write_options,
 )
-from extrap_train.store.atomic import file_lock
-from extrap_train.tasks.results import Finished, Results, draw_curve, draw_views, write_results
-from extrap_train.tasks.seen_before import require_unseen
+from extrap_train.store.cache import REMEDY, Conflict, claim
+from extrap_train.store.manifest import Manifest
+from extrap_train.store.outcome import Outcome
+from extrap_train.tasks.leakage import require_unseen
+from extrap_train.tasks.results import Results, draw_curve, draw_views, write_results
 from extrap_train.tasks.training_data import data_module, prepared_data, validation_names
 from extrap_train.terminal import terminal
-from extrap_train.trained_on import TrainedOn
 
 
-def run(config: TrainConfig) -> Path:
+def run(config: TrainConfig) -> Outcome:
     """Train a category model and leave weights, metrics, pictures and `summary.json` behind.
 
     Nothing of a run is begun or removed before its options, its start and its data are known to be
@@ -67,38 +73,63 @@ def run(config: TrainConfig) -> Path:
     prepared = prepared_data(config)
     data = data_module(config, prepared)
     seconds = {"prepare": time.perf_counter() - started}
-    trained_on = TrainedOn.of(config.category.members, prepared)
-    require_unseen(config.model.start, trained_on)
-    with _opened(folder, config, trained_on) as opening:
+    manifest = run_manifest(config, prepared)
+    require_unseen(config.model.start, manifest)
+    with _opened(folder, config, manifest, console) as opening:
         if opening.is_finished:
             steps = Finished.read(folder).steps
             console.print(f"already trained for {steps} steps: {folder.path}")
-            return folder.path
-        training = CategoryTraining(model, config, validation_names(data), distance)
-        _train(training, data, opening.checkpoint, folder, seconds)
-        if is_first():
-            save_model(training.model, folder.model)
-            draw_curve(folder)
-            results = _results(training, prepared, missing, seconds)
-            write_results(results, config, folder, console)
-    return folder.path
+        else:
+            training = CategoryTraining(model, config, validation_names(data), distance)
+            _train(training, data, opening.checkpoint, folder, seconds)
+            if is_first():
+                save_model(training.model, folder.model)
+                draw_curve(folder)
+                results = _results(training, prepared, missing, seconds)
+                write_results(results, config, folder, console)
+        if is_first():  # a longer training goes on from the newest, but for a sweep's job
+            thin_checkpoints(folder.checkpoints, keep=0 if in_sweep() else 1)
+    return Outcome(folder.path, opening.is_finished)
 
 
 @contextmanager
-def _opened(folder: RunFolder, config: TrainConfig, trained_on: TrainedOn) -> Iterator[Opening]:
+def _opened(
+    folder: RunFolder, config: TrainConfig, manifest: Manifest, console: Console
+) -> Iterator[Opening]:
     """The run, closed to other commands; the first process opens it, the others follow."""
     if not is_first():
         yield join(folder.path)
         return
-    taken = f"{folder.path}: another process is training this run; wait for it or give run=NAME"
-    with file_lock(folder.lock, taken):
-        open_run(config, trained_on)
+    resume = config.resume and folder.has_learnt
+    with claim(folder.path, manifest, resume=resume) as claimed:
+        if not claimed.is_reused:
+            claimed.begin()
+        require_same_options(folder, config)  # another process may have finished it meanwhile
+        opening = _opening(folder, config, console)
+        if not opening.is_finished:
+            write_options(folder, config, at_least=_resumed_step(opening.checkpoint))
         point_latest(folder)
-        newest = checkpoints(folder.checkpoints)[-1:]
-        is_over = folder.summary.is_file() and Finished.read(folder).answers(config)
-        opening = Opening(is_over, str(newest[0]) if newest else None)
         announce(folder.path, opening)
         yield opening
+
+
+def _opening(folder: RunFolder, config: TrainConfig, console: Console) -> Opening:
+    finished = Finished.read(folder) if folder.summary.is_file() else None
+    if finished is not None and finished.answers(config):
+        return Opening(is_finished=True, checkpoint=None)
+    newest = newest_intact(folder.checkpoints, console.print)
+    if newest is None and finished is not None and finished.steps > config.trainer.steps:
+        raise Conflict(
+            f"{folder.path}: made with different trainer.steps (was {finished.steps}, now "
+            f"{config.trainer.steps}); {REMEDY}"
+        )
+    if newest is not None:
+        console.print(f"resuming at step {step_of(newest)}: {folder.path}")
+    return Opening(is_finished=False, checkpoint=str(newest) if newest else None)
+
+
+def _resumed_step(checkpoint: str | None) -> int:
+    return step_of(Path(checkpoint)) if checkpoint else 0
 
 
 def _train(
@@ -110,12 +141,19 @@ def _train(
 ) -> None:
     """Train and validate, and note how long both took."""
     started = time.perf_counter()
-    trainer = _trainer(training.config, folder, checkpoint)
-    with advice_where_memory_ends(training.config.trainer), _ended_together(trainer):
+    every = data.batches_per_epoch
+    kept = Checkpoints(folder.checkpoints, every)
+    trainer = _trainer(training.config, folder, checkpoint, kept)
+    with (
+        _ended_together(trainer),
+        kept.stoppable(),
+        restoring(checkpoint, lambda: kept.has_begun),
+        advice_where_memory_ends(training.config.trainer),
+    ):
         trainer.fit(training, data, ckpt_path=checkpoint, weights_only=True)
-    seconds["train"] = time.perf_counter() - started
-    if training.validated_step != trainer.global_step:
-        trainer.validate(training, data, verbose=False)
+        seconds["train"] = time.perf_counter() - started
+        if training.validated_step != trainer.global_step:
+            trainer.validate(training, data, verbose=False)
     seconds["validate"] = training.validation_seconds
 
 
@@ -180,17 +218,19 @@ class _Pictures(lightning.Callback):
             draw_views(pl_module.pictures(), self.folder / f"step-{trainer.global_step:08d}.png")
 
 
-def _trainer(config: TrainConfig, folder: RunFolder, checkpoint: str | None) -> lightning.Trainer:
+def _trainer(
+    config: TrainConfig, folder: RunFolder, checkpoint: str | None, kept: Checkpoints
+) -> lightning.Trainer:
     options = config.trainer
-    resumed_step = int(Path(checkpoint).stem.split("-")[1]) if checkpoint else 0
-    epoch = min(options.checkpoint_every, options.steps)
+    resumed_step = _resumed_step(checkpoint)
     return lightning.Trainer(
         accelerator=options.accelerator,
         devices=options.devices,
         precision=cast(Any, options.precision),
         max_steps=options.steps,
         max_epochs=-1,
-        check_val_every_n_epoch=max(1, options.validate_every // epoch),
+        check_val_every_n_epoch=max(1, options.validate_every // kept.every),
+        reload_dataloaders_every_n_epochs=int(resumed_step % kept.every > 0),  # a short first epoch
         num_sanity_val_steps=0,
         use_distributed_sampler=False,
         enable_checkpointing=False,
@@ -206,6 +246,6 @@ def _trainer(config: TrainConfig, folder: RunFolder, checkpoint: str | None) -> 
             *([AveragedWeights(options.ema_decay)] if options.ema_decay else []),
             StepProgress(options.steps),
             _Pictures(folder.samples),
-            EpochCheckpoints(folder.checkpoints),
+            kept,
         ],
     )

@@ -14,14 +14,14 @@ from extrap_train.diffusion.layout import arranged
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.metrics import lpips_or_reason
-from extrap_train.runs import RunFolder, provenance
+from extrap_train.runs import RunFolder, provenance, trained_on
+from extrap_train.store.cache import Conflict, read_manifest
 from extrap_train.tasks.category import quieten_lightning
+from extrap_train.tasks.leakage import require_unseen
 from extrap_train.tasks.results import Results, write_results
 from extrap_train.tasks.saved_model import require_as_said
-from extrap_train.tasks.seen_before import require_unseen
 from extrap_train.tasks.training_data import data_module, prepared_data, validation_names
 from extrap_train.terminal import terminal
-from extrap_train.trained_on import TrainedOn
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,14 @@ class RunData:
         """InputError where the options and what lies there today are not what it was trained on."""
         started = time.perf_counter()
         prepared = prepared_data(config)
-        today = TrainedOn.of(config.category.members, prepared)
-        today.require_same(trained.data, "measure another run=NAME, or train one anew")
+        before = read_manifest(trained.path, "train another run=NAME")
+        inputs, split = trained_on(config, prepared)
+        today = replace(before, inputs={**before.inputs, **inputs}, split=split)
+        if differences := today.differences(before):
+            raise Conflict(
+                f"{trained.path}: trained on different {', '.join(differences)}; restore the data "
+                "and their options, or measure another run=NAME"
+            )
         saved = saved_config(trained.model)
         require_as_said(saved, config.model, trained.model)
         require_unseen(saved.start, today)

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from rich.console import Console
 from rich.table import Table
@@ -26,7 +27,7 @@ class Results:
     """What training and validation found."""
 
     scores: pd.DataFrame
-    """A row per held-out view and method."""
+    """One row per held-out view and method."""
     shown: Prediction
     """The views for the picture sheet."""
     missing: dict[str, str]
@@ -38,47 +39,23 @@ class Results:
     provenance: dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Finished:
-    """What the summary of a finished run says of it."""
-
-    steps: int
-    measured: dict[str, Any]
-    """The options under `validation` that it was measured with."""
-
-    @classmethod
-    def read(cls, folder: RunFolder) -> "Finished":
-        """Of a run that has a summary; InputError where that is damaged."""
-        try:
-            summary = json.loads(folder.summary.read_bytes())
-            return cls(int(summary["steps"]), dict(summary["provenance"]["validation"]))
-        except (ValueError, KeyError, TypeError) as error:
-            reason = f"{type(error).__name__}: {error}".splitlines()[0]
-            raise InputError(
-                f"{folder.summary}: is damaged ({reason}); delete it, and task=category measures "
-                "the run again"
-            ) from None
-
-    def answers(self, config: TrainConfig) -> bool:
-        """Whether it was trained for at least these steps and measured in this way.
-
-        That the data are the same is `open_run`'s to see.
-        """
-        return self.steps >= config.trainer.steps and self.measured == asdict(config.validation)
-
-
 def write_results(
     results: Results, config: TrainConfig, folder: RunFolder, console: Console
 ) -> None:
-    """Write tables, pictures and, last of all, the summary that marks the run as finished."""
+    """Write tables, pictures and, last of all, the summary that marks the run as finished.
+
+    Raises InputError, before anything is written, if a score that must be a number is none.
+    """
+    _require_finite(results)
     validation = summarise(results.scores)
+    missing = results.missing | _undefined(validation["model"], results.missing)
     text = io.StringIO()
     results.scores.to_csv(text, index=False)
     write_atomic(folder.path / "validation.csv", text.getvalue().encode())
     draw_views(results.shown, folder.samples / "final.png")
     summary = {
         "validation": validation,
-        "missing": results.missing,
+        "missing": missing,
         "seconds": results.seconds,
         "steps": results.steps,
         "parameters": results.parameters,
@@ -86,9 +63,37 @@ def write_results(
     }
     write_atomic(folder.summary, (json.dumps(without_nan(summary), indent=1) + "\n").encode())
     console.print(_table(validation))
-    for name, reason in results.missing.items():
+    for name, reason in missing.items():
         console.print(f"missing {name}: {reason}")
     console.print(f"pictures: {folder.samples / 'final.png'}\nresult: {folder.path}")
+
+
+_WITHOUT_PIXELS = {
+    "psnr_holes": "no held-out view has a pixel that no reference shows",
+    "psnr_warped": "no held-out view has a pixel that a reference shows",
+}
+
+
+def _require_finite(results: Results) -> None:
+    """Scores over some of a view's pixels are undefined where there are none; others never are."""
+    optional = {*_WITHOUT_PIXELS, *results.missing}
+    for name in results.scores.columns.difference(["method", "view", *optional]):
+        odd = results.scores[~np.isfinite(results.scores[name])]
+        if len(odd):
+            method, view = odd.iloc[0][["method", "view"]]
+            raise InputError(
+                f"{name} of {method} is not a number in {len(odd)} held-out views (first: {view}): "
+                "lower model.learning_rate, or sample with other options under sampler"
+            )
+
+
+def _undefined(means: dict[str, float], missing: dict[str, str]) -> dict[str, str]:
+    """Why a metric has no mean, where that is no fault."""
+    return {
+        name: reason
+        for name, reason in _WITHOUT_PIXELS.items()
+        if name in means and math.isnan(means[name]) and name not in missing
+    }
 
 
 def draw_views(prediction: Prediction, path: Path) -> None:

@@ -9,7 +9,8 @@ from benchmarks.training import TrainedModel, trained_models
 from data_prep.split import split_sequences
 from extrap_train.config import CapturesConfig, MethodConfig
 from extrap_train.errors import InputError
-from extrap_train.trained_on import CategoryData, TrainedOn
+from extrap_train.store.manifest import MANIFEST, Manifest, Split
+from extrap_train.store.records import write_record
 from tests.captures import write_capture
 
 _NAMES = ("a", "b", "c", "d", "e", "f")
@@ -29,7 +30,7 @@ def _models(
     train = tuple(name for name in _NAMES if name not in test)
     run = folder / "cup-run"
     run.mkdir(parents=True)
-    TrainedOn({"cup": CategoryData(source, "key", "split", train, test)}).write(run / "data.json")
+    write_record(run / MANIFEST, Manifest.of({}, {}, {"cup": Split(source, train, test)}))
     given = weights or str(folder / "{category}-run" / "model")
     method = MethodConfig("mine", factory="a.B", options={"weights": given})
     return trained_models([method, MethodConfig("other", factory="a.C")], ["cup"])

@@ -1,19 +1,11 @@
-"""What keeps a run alive: whole files, a table that forgets what a killed run did behind its
-checkpoint.
-"""
+"""What a run shows on its way: a table that forgets what a killed run did behind its checkpoint."""
 
-import os
 from pathlib import Path
 
 import pytest
 import torch
 
-from extrap_train.diffusion.callbacks import (
-    AveragedWeights,
-    MetricsTable,
-    WholeCheckpointIO,
-    checkpoints,
-)
+from extrap_train.diffusion.callbacks import AveragedWeights, MetricsTable
 from extrap_train.errors import InputError
 
 
@@ -38,44 +30,21 @@ def test_a_resumed_table_drops_what_lies_behind_the_checkpoint(tmp_path: Path) -
     assert path.read_text().split() == ["step,loss", "20,20", "40,40", "60,7"]
 
 
-def test_a_checkpoint_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
-    target = tmp_path / "step-00000001.ckpt"
-    WholeCheckpointIO().save_checkpoint({"a": torch.ones(2)}, target)
-    assert torch.equal(WholeCheckpointIO().load_checkpoint(target)["a"], torch.ones(2))
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot be written"):
-        WholeCheckpointIO().save_checkpoint({}, tmp_path / "file" / "step-00000002.ckpt")
-    assert checkpoints(tmp_path) == [target]
-
-
-def test_a_checkpoint_has_its_name_only_once_it_is_on_the_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    were_there: list[bool] = []
-    target = tmp_path / "step-00000001.ckpt"
-    monkeypatch.setattr(os, "fsync", lambda _: were_there.append(target.exists()))
-    WholeCheckpointIO().save_checkpoint({"a": torch.ones(2)}, target)
-    assert were_there == [False, True]
-
-
-def test_a_checkpoint_with_code_in_it_is_refused(tmp_path: Path) -> None:
-    class Evil:
-        def __reduce__(self) -> tuple[object, tuple[str]]:
-            return print, ("code ran",)
-
-    torch.save({"a": Evil()}, tmp_path / "step-00000001.ckpt")
-    with pytest.raises(InputError, match=r"Weights only load failed.*; delete it"):
-        WholeCheckpointIO().load_checkpoint(tmp_path / "step-00000001.ckpt")
-
-
-def test_a_damaged_checkpoint_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "step-00000001.ckpt"
-    WholeCheckpointIO().save_checkpoint({"a": torch.ones(9)}, path)
-    for kept in (0, 10, 300):
-        path.write_bytes(path.read_bytes()[:kept] or b"")
-        with pytest.raises(InputError, match=r"step-00000001\.ckpt: cannot be resumed from"):
-            WholeCheckpointIO().load_checkpoint(path)
-        WholeCheckpointIO().save_checkpoint({"a": torch.ones(9)}, path)
+@pytest.mark.parametrize(
+    "content",
+    [
+        "loss\n1",
+        "step,loss\nx,1",
+        "step,loss\n1,[[",
+        "step,loss\n\x00,1",
+        "step\n1.5",
+        "step,loss\n20,1,2\n,3",
+    ],
+)
+def test_a_damaged_table_is_one_line(tmp_path: Path, content: str) -> None:
+    (tmp_path / "metrics.csv").write_text(content)
+    with pytest.raises(InputError, match=r"metrics\.csv: damaged"):
+        MetricsTable(tmp_path / "metrics.csv", 40)
 
 
 def test_the_average_follows_fast_at_first_and_slowly_later() -> None:

@@ -1,7 +1,6 @@
 """A model is never measured on what its start, or that one's start, was trained on."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,26 +15,28 @@ from extrap_train.config import (
 )
 from extrap_train.diffusion.packaged import MODEL_CONFIG, packaged_names, packaged_weights
 from extrap_train.errors import InputError
+from extrap_train.store.manifest import MANIFEST, Manifest, Split
+from extrap_train.store.records import write_record
 from extrap_train.tasks import category
-from extrap_train.tasks.seen_before import require_unseen
-from extrap_train.trained_on import CategoryData, TrainedOn
+from extrap_train.tasks.leakage import require_unseen
 
 
-def _split(test: int, seed: int | None = 0, of: str = "hydrant") -> TrainedOn:
-    """Of rendered captures, the first `test` of which are held out."""
+def _split(
+    test: int, seed: int | None = 0, of: str = "hydrant", source: str = "synthetic"
+) -> Manifest:
+    """Of a run whose first `test` captures are held out."""
     names = tuple(f"{index:04d}" for index in range(12))
-    data = CategoryData("synthetic", "key", "split", names[test:], names[:test], seed)
-    return TrainedOn({of: data})
+    return Manifest.of({}, {}, {of: Split(source, names[test:], names[:test], seed)})
 
 
-def _model(run: Path, start: str | None, trained_on: TrainedOn | None) -> str:
+def _model(run: Path, start: str | None, manifest: Manifest | None) -> str:
     """The model's folder of a run that began with `start`."""
     folder = run / "model"
     folder.mkdir(parents=True)
     options = json.loads((packaged_weights("base") / MODEL_CONFIG).read_text())
     (folder / MODEL_CONFIG).write_text(json.dumps(options | {"start": start}))
-    if trained_on is not None:
-        trained_on.write(run / "data.json")
+    if manifest is not None:
+        write_record(run / MANIFEST, manifest)
     return str(folder)
 
 
@@ -52,10 +53,10 @@ def test_every_packaged_model_says_what_it_has_seen(name: str) -> None:
     [
         _split(7, seed=1),
         _split(7, of="vase"),
-        TrainedOn({"hydrant": replace(_split(7).categories["hydrant"], source="co3d")}),
+        _split(7, source="co3d"),
     ],
 )
-def test_what_is_only_called_alike_is_not_the_same(unseen: TrainedOn) -> None:
+def test_what_is_only_called_alike_is_not_the_same(unseen: Manifest) -> None:
     require_unseen("base", unseen)
 
 
@@ -80,6 +81,14 @@ def test_a_run_counts_for_what_it_was_trained_on(tmp_path: Path) -> None:
         require_unseen(own, _split(7, seed=None))
 
 
+@pytest.mark.parametrize("content", ["", "[" * 20_000, '{"split": {"hydrant": []}}', "{}"])
+def test_a_start_with_a_damaged_manifest_is_refused(tmp_path: Path, content: str) -> None:
+    own = _model(tmp_path / "run", None, _split(2))
+    (tmp_path / "run" / MANIFEST).write_text(content)
+    with pytest.raises(InputError, match=r"manifest\.json"):
+        require_unseen(own, _split(2))
+
+
 def test_a_model_that_says_nothing_is_taken_at_that(tmp_path: Path) -> None:
     require_unseen(_model(tmp_path / "run", None, None), _split(7))
     require_unseen(str(tmp_path / "published.ckpt"), _split(7))
@@ -90,7 +99,7 @@ def test_a_training_that_would_hold_out_what_its_start_has_seen_is_not_begun(
 ) -> None:
     monkeypatch.setattr(category, "prepared_data", lambda _: [])
     monkeypatch.setattr(category, "data_module", lambda *_: None)
-    monkeypatch.setattr(TrainedOn, "of", lambda *_: _split(7))
+    monkeypatch.setattr(category, "run_manifest", lambda *_: _split(7))
     config = TrainConfig(
         category=CategoryConfig("hydrant", ["hydrant"]),
         data=SyntheticConfig(test_sequences=7),
