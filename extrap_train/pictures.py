@@ -1,4 +1,4 @@
-"""Contact sheets: what a person looks at beside the numbers."""
+"""Pictures that go with the numbers: contact sheets, curves and films."""
 
 import io
 import itertools
@@ -60,9 +60,9 @@ def error_map(
 def contact_sheet(
     columns: dict[str, Float[Tensor, "b 3 h w"]], path: Path, captions: Sequence[str] = ()
 ) -> None:
-    """A row per example and a titled column per kind of picture, written as PNG.
+    """Write a PNG with one row for each example and one titled column for each kind of picture.
 
-    `captions`, one a row or none at all, stand above the rows and say what these show.
+    `captions`, one for each row or none at all, stand above the rows.
     """
     titles = list(columns)
     pictures = [columns[title].detach().float().cpu().clamp(0, 1) for title in titles]
@@ -86,10 +86,10 @@ def contact_sheet(
 
 
 def _written_on(sheet: np.ndarray, texts: dict[tuple[int, int], str]) -> bytes:
-    """A PNG of the sheet with texts, by the (x, y) of their upper left corners."""
+    """The sheet as PNG, with texts drawn on it at their upper left corners (x, y)."""
     picture = Image.fromarray(sheet)
     draw = ImageDraw.Draw(picture)
-    # matplotlib brings it along: Pillow's own font has no arrows, and few of the letters of names.
+    # From matplotlib: Pillow's own font has no arrows and few letters.
     font = ImageFont.truetype(font_manager.findfont("DejaVu Sans"), _FONT_PIXELS)
     for place, text in texts.items():
         draw.text(place, text, fill=(0, 0, 0), font=font)
@@ -99,7 +99,7 @@ def _written_on(sheet: np.ndarray, texts: dict[tuple[int, int], str]) -> bytes:
 
 
 def curve(steps: list[int], series: dict[str, list[float]], label: str, path: Path) -> None:
-    """Line plot over training steps, written as PNG."""
+    """Plot lines over training steps, as PNG."""
     figure, axes = plt.subplots(figsize=(6, 4), layout="constrained")
     for name, values in series.items():
         axes.plot(steps, values, marker="o", markersize=3, label=name)
@@ -113,7 +113,7 @@ def curve(steps: list[int], series: dict[str, list[float]], label: str, path: Pa
 
 
 def picture(image: Float[Tensor, "3 h w"], path: Path) -> None:
-    """One picture, pixel by pixel, written as PNG."""
+    """Write one picture as PNG."""
     content = io.BytesIO()
     Image.fromarray(to_eight_bits(image).transpose(1, 2, 0)).save(content, "png")
     write_atomic(path, content.getvalue())
@@ -144,7 +144,7 @@ def picture_names(names: Sequence[str]) -> list[str]:
 
 
 def film(images: Float[Tensor, "n 3 h w"], path: Path, frames_per_second: int = 12) -> None:
-    """Pictures one after the other, enlarged to be seen, written as GIF or MP4 by the name's end.
+    """Write pictures as an animation, GIF or MP4 by the file's suffix, small ones enlarged.
 
     The MP4 holds VP9, which browsers and players read; a GIF repeats for ever.
     """
@@ -166,7 +166,7 @@ def film(images: Float[Tensor, "n 3 h w"], path: Path, frames_per_second: int = 
 
 
 def _enlarged(pixels: np.ndarray) -> np.ndarray:
-    """By whole numbers, to at least a tile's size, with even sides, which video needs."""
+    """Enlarged by a whole number to at least a tile's size, with even sides, as video needs."""
     scale = max(1, round(_LEAST_TILE_PIXELS / pixels.shape[2]))
     large = pixels.repeat(scale, 1).repeat(scale, 2)
     return np.ascontiguousarray(large[:, : large.shape[1] // 2 * 2, : large.shape[2] // 2 * 2])

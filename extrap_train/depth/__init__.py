@@ -16,7 +16,7 @@ from extrap_train.geometry.cameras import transform, unproject
 from extrap_train.views import View
 
 RELIABLE_CONFIDENCE = 0.3
-"""From here on a depth is to be used: about half of what lies below is wrong, little above."""
+"""Least confidence of a depth to be used: about half of what lies below is wrong, little above."""
 
 
 class NoDepthError(InputError):
@@ -49,7 +49,7 @@ class DepthMap:
 def point_maps_of(
     first: View, first_map: DepthMap, second: View, second_map: DepthMap
 ) -> PointMaps:
-    """The points that two depth maps stand for."""
+    """Unproject two depth maps to points in the first camera's frame."""
     second_to_first = first.camera.world_to_cam @ second.camera.cam_to_world
     points = unproject(second_map.depth, second.camera)
     return PointMaps(

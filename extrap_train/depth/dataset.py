@@ -1,4 +1,4 @@
-"""The depth that views bring along: CO3D's, or the exact depth of rendered ones."""
+"""The depth that comes with the data: CO3D's, a capture's, or the exact depth of renderings."""
 
 import logging
 from collections.abc import Sequence
@@ -37,8 +37,13 @@ class DatasetDepth:
         if without and len(without) == len(views):
             _depth(without[0])
         if without:
-            first = without[0].name or "a view"
-            LOG.warning("no depth comes with %d views of %d: %s", len(without), len(views), first)
+            LOG.warning(
+                "depth=dataset: %d of %d views have no depth (%s is the first); use depth=stereo "
+                "to estimate it from the photographs",
+                len(without),
+                len(views),
+                without[0].name or "a view",
+            )
         return [
             DepthMap(*torch.zeros_like(view.image[:2]))
             if view.depth is None

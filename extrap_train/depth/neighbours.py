@@ -36,7 +36,7 @@ def choose_neighbours(
     count: int,
     limit_rad: float = LIMIT_RAD,
 ) -> list[list[int]]:
-    """For every camera the indices of up to `count` others, by turns from its left and its right.
+    """For every camera the indices of up to `count` others, alternating between left and right.
 
     Angles are those at `center`, up to `limit_rad`; without one (cameras that look the same way)
     the nearest cameras are taken.

@@ -179,7 +179,7 @@ def test_a_frame_whose_annotation_names_no_depth_costs_no_more_than_itself(
         data = prepared(photographs)
     name = Path(entry["image"]["path"]).name
     assert data.manifest["sequences"] == {"kept": len(NAMES), "dropped": 0, "failed": 0}
-    assert f"no depth comes with 1 views of {FRAMES}: {name}" in caplog.text
+    assert f"1 of {FRAMES} views have no depth ({name}" in caplog.text
     # Its photograph is as good a query as any; a reference it cannot be.
     index = list(data.names("cup/fine")).index(name)
     pairs = [pair for split in ("train", "test") for pair in data.pairs(split)]
