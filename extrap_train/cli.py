@@ -21,13 +21,14 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from extrap_train.command_options import GROUPS, CommandOptions, choices_of
-from extrap_train.config import TASKS, DataPrepConfig, TrainConfig, validate
+from extrap_train.config import TASKS, DataPrepConfig, TrainConfig, notes, validate
 from extrap_train.errors import InputError
 from extrap_train.exits import ends_in_one_line
 from extrap_train.help_text import help_text
 from extrap_train.option_errors import explain
 from extrap_train.overrides import CommandLine
 from extrap_train.store.outcome import Outcome
+from extrap_train.terminal import terminal
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 """What a full disk says, wherever it is written to."""
@@ -87,6 +88,8 @@ def _compose(options: CommandOptions, run: Callable[[Any], Outcome | Path | None
             output = typed.output
             _check_processes(typed)
             _use_threads(typed.threads)
+            for note in notes(typed):
+                terminal(stderr=True).print(f"note: {note}")
             return run(typed)
         except OSError as error:
             said = _remedy(error, output)

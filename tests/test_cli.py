@@ -322,3 +322,41 @@ def test_a_start_that_is_no_model_lists_those_in_the_package(
     message = _error(["category=hydrant", "model.start=nonsense"], monkeypatch, tmp_path)
     assert "model.start=nonsense is neither a file or folder of weights" in message
     assert "nor one of the package's: base" in message
+
+
+@pytest.mark.parametrize(
+    ("words", "notes"),
+    [
+        (["data.image_size=256"], ["model.image_size=64"]),
+        (["data.image_size=256", "model.image_size=128", "prep.image_size=256"], []),
+        (["data.image_size=256", "task=view"], []),
+        ([], []),
+    ],
+)
+def test_photographs_larger_than_what_is_painted_are_noted(
+    words: list[str],
+    notes: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr("extrap_train.__main__.task", lambda _: lambda _: None)
+    monkeypatch.setattr(sys, "argv", ["it", "category=hydrant", *words])
+    main()
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == len(notes)
+    assert all(note in line for note, line in zip(notes, said, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("words", "workers"), [(["threads=3"], 3), (["threads=3", "workers=2"], 2), ([], None)]
+)
+def test_data_prep_takes_threads_for_its_processes(
+    words: list[str], workers: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[int | None] = []
+    take = "extrap_train.tasks.prepare.prepare_category"
+    monkeypatch.setattr(take, lambda *_, **options: asked.append(options["workers"]))
+    monkeypatch.setattr("data_prep.report.write_report", lambda *_: None)
+    monkeypatch.setattr(sys, "argv", ["it", "category=hydrant", *words])
+    prepare()
+    assert asked == [workers]

@@ -15,7 +15,7 @@ from extrap_train.config.benchmark import (
     ScoringConfig,
     TableConfig,
 )
-from extrap_train.config.checks import required_file, validate, validate_model
+from extrap_train.config.checks import notes, required_file, validate, validate_model
 from extrap_train.config.commands import TASKS, DataPrepConfig, TrainConfig
 from extrap_train.config.completion import CompletionConfig, ConfidenceConfig, SplatsConfig
 from extrap_train.config.data import (
@@ -107,6 +107,7 @@ __all__ = [
     "ValidationConfig",
     "check_options",
     "dotted",
+    "notes",
     "options_of",
     "placed",
     "placed_value",

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from extrap_train.config.commands import DataPrepConfig, TrainConfig
-from extrap_train.config.data import Co3dConfig, PrepConfig
+from extrap_train.config.data import Co3dConfig, PrepConfig, SyntheticConfig
 from extrap_train.config.model import NEAREST_ALONE, ModelConfig, SamplerConfig
 from extrap_train.config.options import check_options
 from extrap_train.config.sampling import check_sampler, sampler_for
@@ -36,6 +36,20 @@ def validate(config: TrainConfig | DataPrepConfig) -> None:
                 "lora.virtual_references=1: one per input is held out; give 2 or more, or 0 "
                 "for the inputs' own pairs"
             )
+
+
+def notes(config: TrainConfig | DataPrepConfig) -> list[str]:
+    """What is allowed and may surprise, one line each."""
+    if not (isinstance(config, TrainConfig) and isinstance(config.data, SyntheticConfig)):
+        return []
+    model, size = config.model, config.data.image_size
+    if config.task not in _ON_PAIRS or size <= model.warp_size:
+        return []
+    return [
+        f"data.image_size={size}: photographs are reduced to prep.image_size={model.warp_size} and "
+        f"views painted at model.image_size={model.image_size}; for larger views give "
+        f"model.image_size={size} prep.image_size={size * model.warp_scale}"
+    ]
 
 
 def _check_files(config: TrainConfig | DataPrepConfig) -> None:

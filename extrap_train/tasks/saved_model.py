@@ -35,12 +35,15 @@ def _require(saved: ModelConfig, asked: ModelConfig, names: Iterable[str], folde
     found, wanted = _flat(saved), _flat(asked)
     for name in names:
         if wanted[name] != (is_so := found.get(name)):
-            remedy = "leave it out, or give weights= that were trained so"
+            remedy = "remove this option, or give weights= that were trained with it"
             if name.startswith("model.sampler."):
-                remedy = f"what samples it otherwise is {name.removeprefix('model.')}="
+                remedy = f"give {name.removeprefix('model.')}= instead"
+            if name == "model.image_size":
+                remedy += (
+                    f" (task=category {name}={asked.image_size} prep.image_size={asked.warp_size})"
+                )
             raise InputError(
-                f"{name}={wanted[name]}, but {folder} was saved with {is_so}, which is what it "
-                f"goes by: {remedy}"
+                f"{name}={wanted[name]}: the weights {folder} fix {name}={is_so}; {remedy}"
             )
 
 

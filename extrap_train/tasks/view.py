@@ -105,7 +105,7 @@ def run(config: TrainConfig) -> None:
         cameras, truth = _cameras(query, inputs.views, config, size)
         generator = scene_generator(config, model)
         made = generate_views(generator, inputs.views, cameras, query.names, config)
-        console.print(f"painted with {used}")
+        console.print(f"painted with {used} at {size} x {size} pixels, which the weights fix")
         _print_shares(made, query.names, console)
         score, why_not = _compare(made, truth, inputs, config, sequence)
         with result.replace() as whole:

@@ -40,13 +40,13 @@ def command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Command:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["model.references=1"], "model.references=1, but .*ours-hydrant was saved with 3"),
+        (["model.references=1"], "model.references=1: .*ours-hydrant fix model.references=3"),
         (
             ["model.sampler.steps=50"],
-            "model.sampler.steps=50, but .* with 2, .* samples it otherwise is sampler.steps=",
+            "model.sampler.steps=50: .*=2; give sampler.steps=",
         ),
-        (["model.octaves=4", "model.unet.heads=8"], "model.unet.heads=8, but .* with 4"),
-        (["model=small_zeronvs"], "model.family=zeronvs, but .* with ours"),
+        (["model.octaves=4", "model.unet.heads=8"], "model.unet.heads=8: .*=4"),
+        (["model=small_zeronvs"], "model.family=zeronvs: .*=ours"),
     ],
 )
 def test_an_option_that_the_weights_contradict_is_refused(
@@ -73,7 +73,7 @@ def test_what_agrees_with_the_weights_is_taken(command: Command, tmp_path: Path)
 
 def test_a_description_of_another_model_is_refused_in_python_too() -> None:
     other = ModelConfig(name="other", family="zeronvs", residual=False, references=1)
-    with pytest.raises(InputError, match=r"model\.family=zeronvs, but .*base was saved with ours"):
+    with pytest.raises(InputError, match=r"model\.family=zeronvs: .*base fix model\.family=ours"):
         open_generator("base", config=other)
     own = load_model(packaged_weights("base")).config
     assert open_generator("base", config=replace(own, name="mine", start=None)).model.config == own
