@@ -3,19 +3,9 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from torchvision.models import AlexNet_Weights, SqueezeNet1_1_Weights, VGG16_Weights
-
 from benchmarks.fingerprint import weights_hash
 from extrap_train.config import ScoringConfig
-from extrap_train.metrics import hub_cache
-
-_DOWNLOADS = {
-    "lpips_alex": AlexNet_Weights.IMAGENET1K_V1,
-    "lpips_vgg": VGG16_Weights.IMAGENET1K_V1,
-    "lpips_squeeze": SqueezeNet1_1_Weights.IMAGENET1K_V1,
-    "dists": VGG16_Weights.IMAGENET1K_V1,
-}
-"""What stands in torch's hub cache under the last part of its address."""
+from extrap_train.metrics import BACKBONES, hub_cache
 
 
 def columns_of(scoring: ScoringConfig) -> list[str]:
@@ -37,7 +27,7 @@ def judging_files(scoring: ScoringConfig) -> dict[str, Path]:
 
 
 def _cached(column: str) -> Path:
-    return hub_cache() / Path(_DOWNLOADS[column].url).name
+    return hub_cache() / BACKBONES["vgg" if column == "dists" else column.removeprefix("lpips_")]
 
 
 def judging_hashes(scoring: ScoringConfig) -> Mapping[str, str]:

@@ -3,15 +3,17 @@ number an image.
 """
 
 import math
+import re
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from skimage.metrics import structural_similarity
-from torch import Tensor
+from torch import Tensor, nn
 
 from extrap_train.errors import InputError
 from extrap_train.weight_files import WeightFile
@@ -19,13 +21,15 @@ from extrap_train.weight_files import WeightFile
 Distance = Callable[[Tensor, Tensor], Tensor]
 """Predictions and truths, `b 3 h w` in [0, 1], to a number each."""
 
-_VGG16 = "vgg16-397923af.pth"
-_BACKBONES = {
+BACKBONES = {
     "alex": "alexnet-owt-7be5be79.pth",
-    "vgg": _VGG16,
+    "vgg": "vgg16-397923af.pth",
     "squeeze": "squeezenet1_1-b8a52dc0.pth",
 }
-"""torchvision's files, by LPIPS's names."""
+"""torchvision's files, by LPIPS's names; each ends with the first digits of its SHA-256."""
+_DOWNLOADS = "https://download.pytorch.org/models"
+_CONVOLUTION = re.compile(r"^(?:net\.slice|stage)\d+\.(?P<layer>\d+)\.(?P<kind>.*(?:weight|bias))$")
+"""LPIPS and DISTS name a backbone's layers by its own numbers."""
 
 
 def quantised(image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
@@ -95,21 +99,23 @@ def lpips_distance(net: str, weights: str | None, option: str) -> Distance:
     """LPIPS with the backbone `alex`, `vgg` or `squeeze`, for images in [0, 1].
 
     `weights` is a full state dict; without it the backbone must lie in torch's hub cache. Raises
-    InputError where neither is there: another network's number is never put in its place. `option`
-    is what the user sets `weights` with.
+    InputError if neither can be used: no other network's number ever takes its place. `option` is
+    what the user sets `weights` with.
     """
     import lpips  # takes a second: only where the metric is wanted
 
-    cached = hub_cache() / _BACKBONES[net]
-    if weights is None and not cached.is_file():
+    if weights is None and not (hub_cache() / BACKBONES[net]).is_file():
         raise InputError(
-            f"LPIPS ({net}) has no weights: give {option}=FILE or put {_BACKBONES[net]} into "
+            f"LPIPS ({net}) has no weights: give {option}=FILE or put {BACKBONES[net]} into "
             "torch's hub cache"
         )
+    backbone = _cached_backbone(net) if weights is None else None
     with warnings.catch_warnings():  # it calls torchvision in a manner that is going out of use
         warnings.simplefilter("ignore", UserWarning)
-        network = lpips.LPIPS(net=net, pnet_rand=weights is not None, verbose=False).eval()
-    if weights is not None:
+        network = lpips.LPIPS(net=net, pnet_rand=True, verbose=False).eval()
+    if backbone is not None:
+        _fill_backbone(network, *backbone)
+    elif weights is not None:
         file = WeightFile(Path(weights), option, f"the full state dict of lpips.LPIPS(net='{net}')")
         file.fill(network, file.tensors(file.read()))
     network.requires_grad_(False)
@@ -139,14 +145,22 @@ def lpips_or_reason(weights: str | None) -> tuple[Distance | None, dict[str, str
 def dists_distance() -> Distance:
     """DISTS (Ding et al., 2020) by torchmetrics, for images in [0, 1].
 
-    Raises InputError where torchvision's VGG-16 is not in torch's hub cache.
+    Raises InputError if torchvision's VGG-16 is not in torch's hub cache, or damaged.
     """
-    cached = hub_cache() / _VGG16
-    if not cached.is_file():
-        raise InputError(f"DISTS has no weights: put {_VGG16} into torch's hub cache")
-    from torchmetrics.functional.image.dists import DISTSNetwork
+    if not (hub_cache() / BACKBONES["vgg"]).is_file():
+        raise InputError(f"DISTS has no weights: put {BACKBONES['vgg']} into torch's hub cache")
+    from torchmetrics.functional.image import dists
+    from torchvision.models import vgg16
 
-    network = DISTSNetwork().eval()
+    def empty_vgg16(weights: object) -> nn.Module:
+        with torch.device("meta"):
+            return vgg16(weights=None)
+
+    backbone = _cached_backbone("vgg")
+    # It would have torchvision unpickle the backbone from the cache, which runs what is in it.
+    with patch.object(dists, "vgg16", empty_vgg16):
+        network = dists.DISTSNetwork().eval()
+    _fill_backbone(network, *backbone)
 
     @torch.no_grad()
     def distance(
@@ -157,6 +171,28 @@ def dists_distance() -> Distance:
         return network(prediction.cpu(), truth.cpu()).flatten()
 
     return distance
+
+
+def _cached_backbone(net: str) -> tuple[WeightFile, dict[str, Tensor]]:
+    """The backbone in torch's hub cache, as torchvision saved it.
+
+    InputError if the file is not the one that its name promises, or cannot be read.
+    """
+    name = BACKBONES[net]
+    file = WeightFile(hub_cache() / name, None, f"download {_DOWNLOADS}/{name} again")
+    file.require_digest(name.rpartition("-")[2].partition(".")[0])
+    return file, file.tensors(file.read())
+
+
+def _fill_backbone(network: nn.Module, file: WeightFile, saved: dict[str, Tensor]) -> None:
+    """Give LPIPS's or DISTS's network its backbone; the other weights stay."""
+    state = network.state_dict()
+    for own in list(state):
+        if layer := _CONVOLUTION.match(own):
+            del state[own]
+            if (key := f"features.{layer['layer']}.{layer['kind']}") in saved:
+                state[own] = saved[key]
+    file.fill(network, state)
 
 
 def hub_cache() -> Path:

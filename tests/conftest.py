@@ -1,6 +1,8 @@
 """Fixtures that every test may use, and how the tests share the machine."""
 
 import os
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 # One thread per worker, and per command that a test starts: the workers share the cores.
@@ -51,3 +53,34 @@ _use_one_thread()  # before fixtures of whole modules
 def _one_thread() -> None:
     """Small scenes gain nothing from a second thread, and threads that wait for work cost time."""
     _use_one_thread()
+
+
+@pytest.fixture
+def umask() -> Iterator[Callable[[int], int]]:
+    """Sets this process's umask until the test ends."""
+    before = os.umask(0o022)
+    yield os.umask
+    os.umask(before)
+
+
+@contextmanager
+def _closed(path: Path) -> Iterator[None]:
+    """A file or folder that this process may not read, whoever runs it."""
+    mode, user = path.stat().st_mode, os.geteuid()
+    path.chmod(0)
+    if user == 0:
+        os.seteuid(65534)
+    try:
+        yield
+    finally:
+        os.seteuid(user)
+        path.chmod(mode)
+
+
+@pytest.fixture
+def closed(tmp_path: Path) -> Callable[[Path], AbstractContextManager[None]]:
+    """Closes a path to this process for as long as a block lasts."""
+    for folder in (tmp_path, *tmp_path.parents):
+        if os.geteuid() == 0 and folder.stat().st_mode & 0o777 == 0o700:
+            folder.chmod(0o711)  # pytest's own, through which the test must pass as another user
+    return _closed

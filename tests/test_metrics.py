@@ -1,18 +1,29 @@
 """Metrics equal independent implementations and are fed the range that they declare."""
 
+import contextlib
+import hashlib
+import io
+import os
+import pickle
+import zipfile
 from pathlib import Path
+from typing import Any
 
+import lpips
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torchmetrics.functional.image import structural_similarity_index_measure
+from torchvision.models import alexnet, squeezenet1_1, vgg16
 
 from extrap_train.errors import InputError
 from extrap_train.metrics import (
+    BACKBONES,
     dists_distance,
     lpips_distance,
+    lpips_or_reason,
     psnr,
     quantised,
     require_unit_range,
@@ -130,22 +141,111 @@ def test_every_missing_backbone_is_named(
         dists_distance()
 
 
+def put_backbone(
+    hub: Path, net: str, content: bytes, monkeypatch: pytest.MonkeyPatch, digest: str | None = None
+) -> Path:
+    """A file in torch's hub cache, named by its digest unless another is given."""
+    digest = digest or hashlib.sha256(content).hexdigest()[:8]
+    monkeypatch.setenv("TORCH_HOME", str(hub))
+    monkeypatch.setitem(BACKBONES, net, f"{net}-{digest}.pth")
+    file = hub / "hub" / "checkpoints" / BACKBONES[net]
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_bytes(content)
+    return file
+
+
+def saved(content: object, **options: Any) -> bytes:
+    buffer = io.BytesIO()
+    torch.save(content, buffer, **options)
+    return buffer.getvalue()
+
+
 def test_dists_is_torchmetrics_with_what_lies_in_the_cache(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, images: tuple[torch.Tensor, torch.Tensor]
 ) -> None:
     """Random VGG weights in the cache: the distance is that of torchmetrics' public function."""
     from torchmetrics.functional.image.dists import deep_image_structure_and_texture_similarity
-    from torchvision.models import vgg16
 
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    monkeypatch.setattr(torch.hub, "load_state_dict_from_url", lambda *_, **__: state)
     monkeypatch.setattr("torchvision.models._api.load_state_dict_from_url", lambda *_, **__: state)
     torch.manual_seed(0)
     state = vgg16(weights=None).state_dict()
-    (tmp_path / "hub" / "checkpoints").mkdir(parents=True)
-    (tmp_path / "hub" / "checkpoints" / "vgg16-397923af.pth").touch()
+    features = {name: x for name, x in state.items() if name.startswith("features.")}
+    put_backbone(tmp_path, "vgg", saved(features), monkeypatch)
     prediction, truth = images
     distance = dists_distance()
     expected = deep_image_structure_and_texture_similarity(prediction, truth)
     torch.testing.assert_close(distance(prediction, truth), expected.detach().flatten())
     torch.testing.assert_close(distance(truth, truth), torch.zeros(3), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("net", ["alex", "squeeze"])
+def test_lpips_is_the_library_s_with_the_cached_backbone(
+    net: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    images: tuple[torch.Tensor, torch.Tensor],
+) -> None:
+    """The library's own loading is the reference: torchvision gives it the same random weights."""
+    torch.manual_seed(0)
+    state = {"alex": alexnet, "squeeze": squeezenet1_1}[net](weights=None).state_dict()
+    put_backbone(tmp_path, net, saved(state), monkeypatch)
+    monkeypatch.setattr("torchvision.models._api.load_state_dict_from_url", lambda *_, **__: state)
+    expected = lpips.LPIPS(net=net, verbose=False)(*images, normalize=True).flatten()
+    found = lpips_distance(net, None, "option")(*images)
+    torch.testing.assert_close(found, expected.detach())
+
+
+class Bomb:
+    """Runs a command when it is unpickled."""
+
+    def __init__(self, target: Path) -> None:
+        self.target = target
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return os.system, (f"touch {self.target}",)
+
+
+@pytest.fixture(params=["pickle", "zip", "legacy", "zip of a pickle", "pickle with a zip behind"])
+def hostile(request: pytest.FixtureRequest, tmp_path: Path) -> bytes:
+    """A file that runs a command in some reader; torch's hub itself unpacks zipped pickles."""
+    state = {"features.0.weight": torch.zeros(1), "bomb": Bomb(tmp_path / "ran")}
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        archive.writestr("net.pth", saved(state, _use_new_zipfile_serialization=False))
+    harmless = saved(squeezenet1_1(weights=None).state_dict(), _use_new_zipfile_serialization=False)
+    return {
+        "pickle": pickle.dumps(state),
+        "zip": saved(state),
+        "legacy": saved(state, _use_new_zipfile_serialization=False),
+        "zip of a pickle": packed.getvalue(),
+        "pickle with a zip behind": harmless + packed.getvalue(),
+    }[request.param]
+
+
+@pytest.mark.parametrize("renamed", [False, True])
+def test_nothing_in_the_hub_cache_is_run(
+    hostile: bytes, renamed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither under the published name, nor under one that promises just this content."""
+    for net in ("squeeze", "vgg"):
+        digest = None if renamed else BACKBONES[net].rpartition("-")[2].removesuffix(".pth")
+        put_backbone(tmp_path, net, hostile, monkeypatch, digest)
+    for read in (lambda: squeeze_lpips(None), dists_distance):
+        with contextlib.suppress(InputError):
+            read()
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize("kept", [0, 1, 1000, -1])
+def test_a_download_that_was_cut_off_is_a_missing_metric_with_the_reason(
+    kept: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = saved(squeezenet1_1(weights=None).state_dict())
+    digest = hashlib.sha256(whole).hexdigest()[:8]
+    file = put_backbone(tmp_path, "squeeze", whole[:kept], monkeypatch, digest)
+    distance, missing = lpips_or_reason(None)
+    assert distance is None
+    (reason,) = missing.values()
+    assert str(file) in reason
+    assert digest in reason
+    assert "\n" not in reason

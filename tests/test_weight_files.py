@@ -2,6 +2,8 @@ import argparse
 import os
 import pickle
 import re
+import stat
+import zipfile
 from collections import OrderedDict
 from pathlib import Path
 
@@ -11,7 +13,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from extrap_train.errors import InputError
-from extrap_train.weight_files import Inert, WeightFile
+from extrap_train.weight_files import Inert, WeightFile, write_tensors
 
 
 def weight_file(path: Path) -> WeightFile:
@@ -133,6 +135,69 @@ def test_no_table_of_tensors(tmp_path):
 def test_another_network(tmp_path, other, said):
     torch.save({"model": other.state_dict()}, tmp_path / "net.pth")
     refused(weight_file(tmp_path / "net.pth"), said)
+
+
+def test_weights_without_permission_are_not_called_damaged(tmp_path, closed):
+    torch.save(network().state_dict(), tmp_path / "net.pth")
+    with closed(tmp_path / "net.pth"):
+        refused(weight_file(tmp_path / "net.pth"), "cannot be opened (Permission denied)")
+    with closed(tmp_path):
+        refused(weight_file(tmp_path / "net.pth"), "cannot be opened (Permission denied)")
+
+
+def test_a_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "net.pth")
+    refused(weight_file(tmp_path / "net.pth"), "is no regular file")
+
+
+def _zipped_again(path: Path, compression: int) -> None:
+    with zipfile.ZipFile(path) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        for name, content in entries.items():
+            archive.writestr(name, content)
+
+
+def test_a_compressed_archive_is_refused_before_it_is_unpacked(tmp_path):
+    """Torch compresses nothing; a bomb's table of 4 GB has 4 MB."""
+    path = tmp_path / "net.pth"
+    torch.save({"model": network().state_dict()}, path)
+    _zipped_again(path, zipfile.ZIP_DEFLATED)
+    refused(weight_file(path), "is a compressed archive")
+
+
+def test_a_shape_of_more_numbers_than_the_file_holds_is_refused(tmp_path):
+    """One number that claims to be a matrix of a terabyte."""
+    state = network().state_dict() | {"0.weight": torch.zeros(1).expand(10**6, 10**6)}
+    torch.save({"model": state}, tmp_path / "net.pth")
+    assert (tmp_path / "net.pth").stat().st_size < 10_000
+    refused(weight_file(tmp_path / "net.pth"), "0.weight has a shape of more numbers")
+
+
+@pytest.mark.parametrize(
+    ("odd", "said"),
+    [
+        (torch.zeros(2, 3).to_sparse(), "is no plain tensor"),
+        (torch.quantize_per_tensor(torch.zeros(2, 3), 0.1, 0, torch.qint8), "is no plain tensor"),
+        (torch.zeros(2, 3, dtype=torch.int64), "of another type (0.weight: torch.int64"),
+        (torch.zeros(2, 3, dtype=torch.complex64), "of another type (0.weight: torch.complex64"),
+    ],
+)
+def test_tensors_of_another_kind_are_refused(tmp_path, odd, said):
+    torch.save({"model": network().state_dict() | {"0.weight": odd}}, tmp_path / "net.pth")
+    refused(weight_file(tmp_path / "net.pth"), said)
+
+
+def test_names_that_are_no_text_are_refused(tmp_path):
+    torch.save({"model": {0: torch.zeros(1), "a": torch.zeros(1)}}, tmp_path / "net.pth")
+    refused(weight_file(tmp_path / "net.pth"), "holds no table of named tensors")
+
+
+def test_what_is_written_may_be_read_as_the_umask_says(tmp_path, umask):
+    for mask, mode in ((0o022, 0o644), (0o002, 0o664), (0o077, 0o600)):
+        umask(mask)
+        write_tensors(network().state_dict(), tmp_path / "net.safetensors")
+        assert stat.S_IMODE((tmp_path / "net.safetensors").stat().st_mode) == mode
 
 
 def test_a_folder_is_called_one(tmp_path):

@@ -11,6 +11,9 @@ from extrap_train.config.sampling import check_sampler, sampler_for
 from extrap_train.config.training import TrainerConfig
 from extrap_train.errors import InputError
 
+_MAX_LEVELS, _MAX_WIDTH = 8, 8192
+_MAX_LATENTS, _MAX_WARP = 256, 4096
+"""Sides of the latents and of the warp: beyond them a view takes tens of gigabytes."""
 _ON_PAIRS = ("category", "validate")
 """Tasks that prepare pairs of photographs."""
 
@@ -122,7 +125,21 @@ def _check_network(model: ModelConfig) -> None:
         raise InputError(f"model.unet.channels={model.unet.channels}: need multiples of {groups}")
     if model.vae is not None and not model.vae.channels:
         raise InputError("model.vae.channels=[]: need a width a level")
+    for part, channels in (
+        ("unet", model.unet.channels),
+        ("vae", model.vae.channels if model.vae else []),
+    ):
+        if len(channels) > _MAX_LEVELS or max(channels, default=0) > _MAX_WIDTH:
+            raise InputError(
+                f"model.{part}.channels: need at most {_MAX_LEVELS} levels of at most "
+                f"{_MAX_WIDTH} channels"
+            )
     factor = model.patch if model.vae is None else 2 ** (len(model.vae.channels) - 1)
+    if model.image_size > _MAX_LATENTS * factor or model.warp_size > _MAX_WARP:
+        raise InputError(
+            f"model.image_size={model.image_size} with model.warp_scale={model.warp_scale}: need "
+            f"at most {_MAX_LATENTS * factor} pixels, and {_MAX_WARP} of the warp"
+        )
     coarsest = factor * 2 ** (len(model.unet.channels) - 1)
     if model.image_size % coarsest:
         raise InputError(

@@ -1,5 +1,6 @@
 """Depth Anything (Yang et al., CVPR and NeurIPS 2024), from transformers, out of a local folder."""
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,12 +16,18 @@ from transformers.utils.hub import cached_file
 
 from extrap_train.device import fastest_device
 from extrap_train.errors import InputError
+from extrap_train.weight_files import WeightFile
 
 _UNUSABLE = (OSError, ValueError, KeyError, TypeError, RuntimeError, SafetensorError)
 """What transformers raises on folders that hold nothing of its own, or something else."""
 
 _HARMLESS: dict[str, Any] = {"local_files_only": True, "trust_remote_code": False}
 """Nothing is downloaded, and code in the folder is neither run nor asked for."""
+_MAX_LAYERS, _MAX_SETTINGS_BYTES = 200, 2**20
+_REMEDY = (
+    "give depth.model=FOLDER with Depth Anything for transformers, such as a download of "
+    "huggingface.co/depth-anything/Depth-Anything-V2-Small-hf"
+)
 _READ = ("config.json", "preprocessor_config.json", "*.safetensors")
 
 
@@ -54,10 +61,12 @@ def read_depth_anything(model: str, device: torch.device | None = None) -> Depth
     Weights are read from safetensors alone. It runs on `device`, by default on the GPU where there
     is one. InputError where it is absent or another model.
     """
+    _require_plausible(model)
     try:
-        kind = AutoConfig.from_pretrained(model, **_HARMLESS).model_type
-        if kind != "depth_anything":
-            raise _refusal(model, f"is a model of kind {kind}")
+        config = AutoConfig.from_pretrained(model, **_HARMLESS)
+        if config.model_type != "depth_anything":
+            raise _refusal(model, f"is a model of kind {config.model_type}")
+        _require_no_larger_than_files(model, config)
         loaded: Any = DepthAnythingForDepthEstimation.from_pretrained(
             model, **_HARMLESS, use_safetensors=True, output_loading_info=True
         )
@@ -97,8 +106,48 @@ def files_read(model: str) -> list[Path]:
     return sorted(file for pattern in _READ for file in folder.glob(pattern))
 
 
+def _require_plausible(model: str) -> None:
+    """InputError for sizes that no model has, before memory for them is asked for."""
+    for name, largest in (("config.json", 65_536), ("preprocessor_config.json", 4096)):
+        for file in (file for file in files_read(model) if file.name == name):
+            left: list[tuple[str, Any]] = [("", _settings(model, file))]
+            while left:
+                key, value = left.pop()
+                if isinstance(value, dict):
+                    left += value.items()
+                elif isinstance(value, list):
+                    left += [(key, x) for x in value]
+                most = _MAX_LAYERS if key == "num_hidden_layers" else largest
+                if isinstance(value, int | float) and not abs(value) <= most:
+                    raise _refusal(model, f"says {key}={value} in its {name}, at most {most}")
+
+
+def _settings(model: str, file: Path) -> Any:
+    try:
+        if file.stat().st_size > _MAX_SETTINGS_BYTES:
+            raise _refusal(model, f"has a {file.name} larger than any settings")
+        return json.loads(file.read_bytes())
+    except OSError as error:
+        raise _refusal(model, f"{file.name} cannot be read ({error.strerror})") from None
+    except (ValueError, RecursionError):
+        raise _refusal(model, f"{file.name} is not valid JSON") from None
+
+
+def _require_no_larger_than_files(model: str, config: Any) -> None:
+    """InputError if the network has more numbers than the files hold: what they lack would be made
+    up in memory, at any size.
+    """
+    with torch.device("meta"):
+        network = DepthAnythingForDepthEstimation(config)
+    wanted = sum(x.numel() for x in network.state_dict().values())
+    found = 0
+    for path in files_read(model):
+        if path.suffix == ".safetensors":
+            file = WeightFile(path, None, _REMEDY)
+            found += sum(x.numel() for x in file.tensors(file.read()).values())
+    if wanted > found:
+        raise _refusal(model, f"holds {found} numbers, but its config.json is of {wanted}")
+
+
 def _refusal(model: str, reason: str) -> InputError:
-    return InputError(
-        f"{model}: {reason}; give depth.model=FOLDER with Depth Anything for transformers, such as "
-        "a download of huggingface.co/depth-anything/Depth-Anything-V2-Small-hf"
-    )
+    return InputError(f"{model}: {reason}; {_REMEDY}")

@@ -6,13 +6,9 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import torch
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors import safe_open
 from torch import Tensor
 
 from extrap_train.config import ModelConfig, dotted, validate_model
@@ -24,11 +20,13 @@ from extrap_train.diffusion.published.meaning import SCHEDULER, require_same_mea
 from extrap_train.diffusion.published.read import SOURCES, Shapes, read_published, weights_at
 from extrap_train.diffusion.transfer import narrowed, turned_pose, widened
 from extrap_train.errors import InputError
-from extrap_train.store.atomic import partial_path, write_atomic
-from extrap_train.weight_files import WeightFile
+from extrap_train.store.atomic import partial_path
+from extrap_train.store.records import read_record, write_record
+from extrap_train.weight_files import WeightFile, write_tensors
 
 _PUBLISHED_CHANNELS = {8: "zeronvs", 11: "megascenes"}
 _COMPACT = "difference.safetensors"
+_REMEDY = "give a model/ folder that task=category wrote"
 _DIFFUSERS_NAME = "diffusion_pytorch_model.safetensors"
 _FILES = {
     "unet": _DIFFUSERS_NAME,
@@ -46,12 +44,12 @@ def save_model(model: ExtrapolationModel, folder: Path, dtype: torch.dtype = tor
     temporary = partial_path(folder)
     shutil.rmtree(temporary, ignore_errors=True)
     try:
-        _write_config(model, temporary)
+        write_record(temporary / MODEL_CONFIG, model.config)
         for part, network in model.parts().items():
             (temporary / part).mkdir()
             state = network.state_dict()  # copied: a module that goes on training keeps its own
             halved = {k: v.detach().to("cpu", dtype).contiguous() for k, v in state.items()}
-            _save(halved, temporary / part / _FILES[part])
+            write_tensors(halved, temporary / part / _FILES[part])
         model.unet.save_config(temporary / "unet")
         model.schedule.save_pretrained(temporary / "scheduler")
         if model.config.vae is not None:
@@ -75,8 +73,8 @@ def save_compact(model: ExtrapolationModel, folder: Path, base: str = "base") ->
     temporary = partial_path(folder)
     shutil.rmtree(temporary, ignore_errors=True)
     try:
-        _write_config(model, temporary)
-        _save(tensors, temporary / _COMPACT, {"base": base, "base_sha256": _digest(start)})
+        write_record(temporary / MODEL_CONFIG, model.config)
+        write_tensors(tensors, temporary / _COMPACT, {"base": base, "base_sha256": _digest(start)})
         shutil.rmtree(folder, ignore_errors=True)
         temporary.replace(folder)
     finally:
@@ -124,21 +122,6 @@ def _digest(folder: Path) -> str:
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
 
 
-def _write_config(model: ExtrapolationModel, folder: Path) -> None:
-    write_atomic(
-        folder / MODEL_CONFIG, (json.dumps(asdict(model.config), indent=1) + "\n").encode()
-    )
-
-
-def _save(tensors: dict[str, Tensor], path: Path, about: Mapping[str, str] | None = None) -> None:
-    try:
-        save_file(tensors, path, metadata={"format": "pt", **(about or {})})
-    except (OSError, SafetensorError) as error:
-        raise InputError(
-            f"{path}: cannot be written ({error}); free space or choose another folder"
-        ) from None
-
-
 def load_model(folder: Path, option: str = "weights") -> ExtrapolationModel:
     """The model of a folder written by `save_model` that `option` named, in float32; strict."""
     config = saved_config(folder)
@@ -155,19 +138,18 @@ def is_own(path: Path) -> bool:
 
 def saved_config(folder: Path) -> ModelConfig:
     """What the model of a folder is: of the types and within the bounds that the command line's
-    options have, too; InputError where the folder says not.
+    options have, too; InputError otherwise.
     """
     file = folder / MODEL_CONFIG
+    config = read_record(file, ModelConfig, _REMEDY)
+    said = json.loads(file.read_bytes())
+    if unknown := sorted(dotted(said).keys() - dotted(asdict(config)).keys()):
+        raise InputError(f"{file}: no model of this project (unknown: {unknown[0]}); {_REMEDY}")
     try:
-        saved = json.loads(file.read_text())
-        typed: Any = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(ModelConfig), saved))
-        validate_model(typed)
-        return typed
+        validate_model(config)
     except InputError as error:
-        raise InputError(f"{file}: no model of this project ({error})") from None
-    except (OSError, ValueError, TypeError, AttributeError, OmegaConfBaseException) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"{file}: no model of this project ({reason})") from None
+        raise InputError(f"{file}: no model of this project ({error}); {_REMEDY}") from None
+    return config
 
 
 def load_weights(

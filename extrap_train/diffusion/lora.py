@@ -11,7 +11,6 @@ import peft
 import torch
 from pydantic import Field
 from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from extrap_train.config import LoraConfig
@@ -26,6 +25,7 @@ from extrap_train.errors import InputError
 from extrap_train.store.atomic import write_atomic
 from extrap_train.store.digests import file_digest
 from extrap_train.store.records import read_record, write_record
+from extrap_train.weight_files import WeightFile
 
 _ATTENTION = ["to_q", "to_k", "to_v", "to_out.0"]
 _CONVOLUTIONS = ["conv1", "conv2"]
@@ -139,15 +139,11 @@ def load_adapter(model: ExtrapolationModel, folder: Path) -> peft.PeftModel:
 
 def _read_tensors(file: Path, sha256: str, remedy: str) -> dict[str, Tensor]:
     """A safetensors file, which holds nothing but tensors of the size that the file has."""
-    if not file.is_file():
-        raise InputError(f"{file}: there is no such file; {remedy}")
+    weights = WeightFile(file, None, remedy)
+    tensors = weights.tensors(weights.read())
     if file_digest(file) != sha256:
         raise InputError(f"{file}: was changed since it was saved; {remedy}")
-    try:
-        return load_file(file)
-    except (OSError, SafetensorError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
-        raise InputError(f"{file}: cannot be read ({reason}); {remedy}") from None
+    return tensors
 
 
 def _require_rank(

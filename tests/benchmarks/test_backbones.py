@@ -1,22 +1,29 @@
 """Weights that appear, or change, are asked; the images that they judge are not made again."""
 
+import hashlib
+import io
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import lpips
 import pytest
 import torch
-from torchvision.models import squeezenet1_1
+from torchvision.models import (
+    AlexNet_Weights,
+    SqueezeNet1_1_Weights,
+    VGG16_Weights,
+    squeezenet1_1,
+)
 
 from benchmarks import scoring
 from benchmarks.__main__ import main
-from benchmarks.backbones import _DOWNLOADS, judging_files
+from benchmarks.backbones import judging_files
 from benchmarks.results import read_results
 from benchmarks.verify import Verification, verify
 from extrap_train.config import LPIPS_NETS, ScoringConfig
 from extrap_train.errors import InputError
-from extrap_train.metrics import dists_distance, lpips_distance
+from extrap_train.metrics import BACKBONES, dists_distance, lpips_distance
 from tests.benchmarks.tables import greys_folder, run_greys
 
 
@@ -30,10 +37,20 @@ def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     scoring._lpips.cache_clear()
 
 
-def _put_backbone(hub: Path, seed: int) -> None:
-    torch.manual_seed(seed)
-    torch.save(squeezenet1_1(weights=None).state_dict(), hub / "squeezenet1_1-b8a52dc0.pth")
-    scoring._lpips.cache_clear()
+@pytest.fixture
+def put_backbone(hub: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
+    """Random weights under the name that promises them."""
+
+    def put(seed: int) -> None:
+        torch.manual_seed(seed)
+        buffer = io.BytesIO()
+        torch.save(squeezenet1_1(weights=None).state_dict(), buffer)
+        digest = hashlib.sha256(buffer.getvalue()).hexdigest()
+        monkeypatch.setitem(BACKBONES, "squeeze", f"squeezenet1_1-{digest[:8]}.pth")
+        (hub / BACKBONES["squeeze"]).write_bytes(buffer.getvalue())
+        scoring._lpips.cache_clear()
+
+    return put
 
 
 def _scored(own: Path, output: Path) -> dict[str, tuple[float | None, float]]:
@@ -43,20 +60,23 @@ def _scored(own: Path, output: Path) -> dict[str, tuple[float | None, float]]:
 
 
 def test_a_backbone_put_into_the_hub_cache_is_used_by_the_next_run(
-    own: Path, hub: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    own: Path,
+    put_backbone: Callable[[int], None],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     before = _scored(own, tmp_path)
     run_greys(own, tmp_path, "scoring.lpips=[squeeze]", quick=True, dry_run=True)
     said = " ".join(capsys.readouterr().out.split())
     assert "lpips_squeeze stays empty: LPIPS (squeeze) has no weights" in said
-    _put_backbone(hub, seed=0)
+    put_backbone(0)
     first = _scored(own, tmp_path)
     assert "0 finished and used again, 2 open" in capsys.readouterr().out
     run_greys(own, tmp_path, "scoring.lpips=[squeeze]", quick=True, dry_run=True)
     said = capsys.readouterr().out
     assert "2 finished and used again, 0 open" in said
     assert "stays empty" not in said
-    _put_backbone(hub, seed=1)
+    put_backbone(1)
     second = _scored(own, tmp_path)
     for method, (value, seconds) in before.items():
         assert value is None
@@ -66,12 +86,15 @@ def test_a_backbone_put_into_the_hub_cache_is_used_by_the_next_run(
 
 
 def test_the_files_are_those_that_the_metrics_ask_for(hub: Path) -> None:
-    with pytest.raises(InputError, match=Path(_DOWNLOADS["dists"].url).name):
+    """And torchvision's own, by the addresses that it downloads them from."""
+    with pytest.raises(InputError, match=BACKBONES["vgg"]):
         dists_distance()
     for net in LPIPS_NETS:
-        with pytest.raises(InputError, match=Path(_DOWNLOADS[f"lpips_{net}"].url).name):
+        with pytest.raises(InputError, match=BACKBONES[net]):
             lpips_distance(net, None, "option")
-    assert set(_DOWNLOADS) == {*(f"lpips_{net}" for net in LPIPS_NETS), "dists"}
+    published = (AlexNet_Weights.DEFAULT, VGG16_Weights.DEFAULT, SqueezeNet1_1_Weights.DEFAULT)
+    names = [weights.url.rpartition("/")[2] for weights in published]
+    assert [BACKBONES[net] for net in ("alex", "vgg", "squeeze")] == names
 
 
 def test_a_named_file_stands_before_the_cached_one(hub: Path) -> None:
@@ -86,7 +109,10 @@ def test_a_named_file_stands_before_the_cached_one(hub: Path) -> None:
 
 
 def test_verification_judges_with_the_very_weights_or_says_that_it_did_not(
-    own: Path, hub: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    own: Path,
+    put_backbone: Callable[[int], None],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     weights = tmp_path / "lpips.pt"
     torch.save(lpips.LPIPS(net="squeeze", pnet_rand=True, verbose=False).state_dict(), weights)
@@ -98,7 +124,7 @@ def test_verification_judges_with_the_very_weights_or_says_that_it_did_not(
     here = {"lpips_squeeze": "its weights are not here; give scoring.lpips_weights.squeeze=FILE"}
     assert verify(folder) == Verification(cells=2, unchecked=here)
     assert verify(folder, {"squeeze": str(moved)}) == Verification(cells=2)
-    _put_backbone(hub, seed=0)
+    put_backbone(0)
     assert "not those" in verify(folder).unchecked["lpips_squeeze"]
     capsys.readouterr()
     assert main(["verify", str(folder.path)]) == 0

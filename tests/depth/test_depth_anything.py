@@ -109,7 +109,7 @@ def test_truncated_or_incomplete_weights(folder):
     refused(folder, "depth.model=FOLDER")
     (folder / "config.json").write_text(json.dumps(content))
     os.truncate(weights, weights.stat().st_size // 2)
-    refused(folder, "cannot be read")
+    refused(folder, "is cut off")
     weights.unlink()
     torch.save({}, folder / "pytorch_model.bin")  # pickles are not read
     refused(folder, "cannot be read")

@@ -183,7 +183,8 @@ def _ddim(schedule: DDIMScheduler, steps: int, eta: float) -> list[Tensor]:
         return torch.randn(1, 4, 3, 3, generator=generator)
 
     timesteps = ddim_timesteps(schedule, SamplerConfig(steps=steps))
-    return [*asked, sample_ddim(denoise, schedule, timesteps, eta, draw_noise)]
+    last = sample_ddim(denoise, schedule, timesteps, eta, draw_noise)
+    return [*asked, last]
 
 
 def _said(timestep: int) -> Tensor:

@@ -14,6 +14,8 @@ from extrap_train.weight_files import WeightFile
 
 HEAD_WIDTH = 64
 """Of every published network, where the file does not say it."""
+MAX_BLOCKS = 100
+"""Of an encoder or decoder; the published ones have at most 24."""
 
 
 def read_network(path: Path, option: str = "depth.checkpoint") -> PointMapNetwork:
@@ -27,7 +29,8 @@ def read_network(path: Path, option: str = "depth.checkpoint") -> PointMapNetwor
     state = _with_both_names(file.tensors(content, "model"))
     expression = ""
     if isinstance(content, Mapping):
-        expression = str(getattr(content.get("args"), "model", ""))
+        said = getattr(content.get("args"), "model", "")
+        expression = said if isinstance(said, str) else ""
     try:
         with torch.device("meta"):
             network = PointMapNetwork(architecture_of(state, expression))
@@ -69,6 +72,8 @@ def _shape(state: Mapping[str, Tensor], name: str, dimensions: int) -> tuple[int
 
 def _blocks(state: Mapping[str, Tensor], name: str) -> int:
     numbers = {found[1] for key in state if (found := re.match(rf"{name}\.(\d+)\.", key))}
+    if len(numbers) > MAX_BLOCKS:
+        raise ValueError(f"{len(numbers)} {name}")
     return len(numbers)
 
 

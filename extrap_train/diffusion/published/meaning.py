@@ -62,6 +62,9 @@ _KEYS: dict[str, dict[str, str]] = {
 """What is compared, with the option that sets it, where one does."""
 
 
+_MAX_BYTES = 2**20
+
+
 def require_same_meaning(folder: Path, networks: Mapping[str, Any], *, to_train: bool) -> None:
     """InputError for the first key of a diffusers folder that the networks have another value of.
 
@@ -87,6 +90,8 @@ def require_same_meaning(folder: Path, networks: Mapping[str, Any], *, to_train:
 
 
 def _read(path: Path) -> dict[str, Any]:
+    if path.stat().st_size > _MAX_BYTES:
+        raise InputError(f"{path}: is larger than any table of settings; download it again")
     said = require_dict(read_json(path), "a table of settings, as in a diffusers folder", path)
     inner = said.get("vision_config")  # of a whole CLIP
     return inner if isinstance(inner, dict) else said
