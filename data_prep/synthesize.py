@@ -23,6 +23,7 @@ from extrap_train.data.synthetic import (
 from extrap_train.errors import InputError
 from extrap_train.jobs import Died, Launcher
 from extrap_train.store.atomic import install_folder, partial_path, remove_leftovers, write_atomic
+from extrap_train.store.records import read_record, write_record
 from extrap_train.terminal import track
 
 LOOK = 2
@@ -32,6 +33,15 @@ RECORD = "synthetic.json"
 STAMP = "synthetic_annotations.json"
 """Beside the annotations: which sequences they list, made with which options."""
 CLOUD_POINTS = 20_000
+
+
+@dataclass(frozen=True)
+class _Record:
+    """`synthetic.json`: the options that a sequence was made with, and its annotations."""
+
+    options: dict[str, int]
+    frames: list[dict[str, Any]]
+    sequence: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -121,15 +131,21 @@ def _state(job: _Job) -> str:
     if not (job.folder / RECORD).exists():
         return "missing"
     record = _read_record(job.folder)
-    return "ready" if record is not None and record["options"] == job.options else "outdated"
+    if (
+        record is None
+        or record.options != job.options
+        or len(record.frames) != job.options["frames"]
+    ):
+        return "outdated"
+    return "ready" if record.sequence.get("sequence_name") == job.name else "outdated"
 
 
-def _read_record(folder: Path) -> dict[str, Any] | None:
+def _read_record(folder: Path) -> _Record | None:
+    """What a sequence's folder was made with; None if that is missing or damaged."""
     try:
-        record = json.loads((folder / RECORD).read_bytes())
-    except (OSError, ValueError):
+        return read_record(folder / RECORD, _Record, "")
+    except InputError:  # rendered again
         return None
-    return record if isinstance(record, dict) and "options" in record else None
 
 
 def _announce(category: str, root: Path, states: list[str]) -> None:
@@ -170,27 +186,24 @@ def _render_sequence(job: _Job) -> None:
             torch.from_numpy(cloud.colors).float(),
         )
         made = workshop / job.category / job.name
-        record = {"options": options, "frames": frames, "sequence": sequence}
-        write_atomic(made / RECORD, json.dumps(record).encode())
+        write_record(made / RECORD, _Record(options, frames, sequence))
         install_folder(made, job.folder, lambda _: _state(job) == "ready")
     finally:
         shutil.rmtree(workshop, ignore_errors=True)
 
 
-def _annotate(
-    root: Path, category: str, records: list[dict[str, Any]], test_sequences: int
-) -> None:
+def _annotate(root: Path, category: str, records: list[_Record], test_sequences: int) -> None:
     """Annotation files of these sequences; left alone where they list the same ones already."""
     stamp = root / category / STAMP
-    content = json.dumps([[r["sequence"], r["options"]] for r in records] + [test_sequences])
+    content = json.dumps([[r.sequence, r.options] for r in records] + [test_sequences])
     if (root / category / FRAME_ANNOTATIONS).exists() and _text(stamp) == content:
         return
-    names = [record["sequence"]["sequence_name"] for record in records]
+    names = [record.sequence["sequence_name"] for record in records]
     write_annotations(
         root,
         category,
-        [frame for record in records for frame in record["frames"]],
-        [record["sequence"] for record in records],
+        [frame for record in records for frame in record.frames],
+        [record.sequence for record in records],
         {"test": names[:test_sequences], "train": names[test_sequences:]},
     )
     write_atomic(stamp, content.encode())

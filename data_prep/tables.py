@@ -18,7 +18,7 @@ from data_prep.pairs import reference_frames
 from data_prep.split import Split
 from data_prep.unit import Unit, Workshop
 from extrap_train.data.frame_files import read_camera_table
-from extrap_train.data.prepared import FORMAT
+from extrap_train.data.prepared import FORMAT, TABLES, table_digest
 from extrap_train.data.sequences import Sequence
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import partial_path, write_atomic
@@ -88,6 +88,7 @@ def write_results(
             "failed": failed,
         },
         "pairs": dict(sorted(parts.items())),
+        "tables": {name: table_digest(folder / f"{name}.parquet") for name in TABLES},
         "versions": {name: package_version(name) for name in _PACKAGES},
     }
     write_atomic(folder / "manifest.json", (json.dumps(manifest, indent=1) + "\n").encode())

@@ -2,8 +2,8 @@
 
 import io
 import itertools
-import os
 import re
+import shutil
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from extrap_train.data.images import to_eight_bits
 from extrap_train.errors import InputError
-from extrap_train.store.atomic import write_atomic
+from extrap_train.store.atomic import partial_path, replace_synced, write_atomic
 
 _HOLE_COLOUR = (1.0, 0.0, 1.0)
 _LEAST_TILE_PIXELS = 128
@@ -149,20 +149,23 @@ def film(images: Float[Tensor, "n 3 h w"], path: Path, frames_per_second: int = 
     The MP4 holds VP9, which browsers and players read; a GIF repeats for ever.
     """
     frames = _enlarged(to_eight_bits(images).transpose(0, 2, 3, 1))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{os.getpid()}.{path.name}")
+    # A folder: the writers go by the file's suffix.
+    workshop = partial_path(path)
     try:
+        workshop.mkdir(parents=True, exist_ok=True)
+        made = workshop / path.name
         if path.suffix == ".gif":
-            pictures = [Image.fromarray(frame) for frame in frames]
-            pause_ms, rest = round(1000 / frames_per_second), pictures[1:]
-            pictures[0].save(
-                temporary, save_all=True, append_images=rest, duration=pause_ms, loop=0
-            )
+            _write_gif(frames, made, frames_per_second)
         else:
-            _write_mp4(frames, temporary, frames_per_second)
-        temporary.replace(path)
+            _write_mp4(frames, made, frames_per_second)
+        replace_synced(made, path)
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be written ({error.strerror or error}); free space or choose another "
+            "folder"
+        ) from None
     finally:
-        temporary.unlink(missing_ok=True)
+        shutil.rmtree(workshop, ignore_errors=True)
 
 
 def _enlarged(pixels: np.ndarray) -> np.ndarray:
@@ -170,6 +173,12 @@ def _enlarged(pixels: np.ndarray) -> np.ndarray:
     scale = max(1, round(_LEAST_TILE_PIXELS / pixels.shape[2]))
     large = pixels.repeat(scale, 1).repeat(scale, 2)
     return np.ascontiguousarray(large[:, : large.shape[1] // 2 * 2, : large.shape[2] // 2 * 2])
+
+
+def _write_gif(frames: np.ndarray, path: Path, frames_per_second: int) -> None:
+    first, *rest = [Image.fromarray(frame) for frame in frames]
+    pause_ms = round(1000 / frames_per_second)
+    first.save(path, save_all=True, append_images=rest, duration=pause_ms, loop=0)
 
 
 def _write_mp4(frames: np.ndarray, path: Path, frames_per_second: int) -> None:
@@ -181,3 +190,5 @@ def _write_mp4(frames: np.ndarray, path: Path, frames_per_second: int) -> None:
     for frame in frames:
         writer.write(frame[..., ::-1])
     writer.release()
+    if int(cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT)) != len(frames):
+        raise OSError("the video is cut off")  # OpenCV raises nothing on a full disk

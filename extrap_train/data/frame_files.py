@@ -13,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
 from jaxtyping import Float, Shaped, UInt8
+from pydantic import TypeAdapter, ValidationError
 from torch import Tensor
 
 from extrap_train.data.paths import file_stamp
@@ -133,10 +134,10 @@ def is_sealed(file: Path, key: str) -> bool:
     """Whether a table is there, made from `key`, and the files beside it are still as long."""
     try:
         seal = pq.read_schema(file).metadata or {}
-        sizes = json.loads(seal.get(_SIZES, b"null"))
-    except (OSError, ValueError):
+        sizes = TypeAdapter(dict[str, int]).validate_json(seal.get(_SIZES, b""), strict=True)
+    except (OSError, pa.ArrowException, ValidationError):
         return False
-    if seal.get(_KEY) != key.encode() or sizes is None:
+    if seal.get(_KEY) != key.encode():
         return False
     stamps = ((file_stamp(file.with_name(name)), size) for name, size in sizes.items())
     return all(stamp is not None and stamp[0] == size for stamp, size in stamps)
@@ -146,7 +147,7 @@ def read_sealed(file: Path, key: str) -> pa.Table | None:
     """The table, if `is_sealed`."""
     try:
         return pq.read_table(file) if is_sealed(file, key) else None
-    except (OSError, pa.ArrowInvalid):
+    except (OSError, pa.ArrowException):
         return None
 
 

@@ -13,9 +13,9 @@
 Frames and pairs lie in folders that other preparations may share; the manifest says which.
 """
 
-import json
+import hashlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -38,19 +38,50 @@ from extrap_train.data.frame_files import (
     pairs_folder,
 )
 from extrap_train.errors import InputError
+from extrap_train.store.records import read_record
 from extrap_train.views import Camera, ViewPair
 
-FORMAT = 3
+FORMAT = 4
 UNTOUCHED = -1
 """In place of the number of a flow: the warp of that pair stays as it is."""
 _REPEATED = ("sequence", "split", "uncorrected")
 """Columns whose words come again row after row: kept as codes, as a million pairs have two million
 such words, which would take a quarter of a gigabyte.
 """
+_REMEDY = "run data_prep again, which makes what is damaged once more"
+TABLES = ("sequences", "frames", "pairs")
 _OPEN_SEQUENCES = 128
 """Sequences whose files stay open: four descriptors each, and a process has about a thousand."""
 
 Arrays = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True)
+class _SequenceCounts:
+    kept: int
+    dropped: int
+    failed: int
+
+
+@dataclass(frozen=True)
+class _Manifest:
+    """`manifest.json`, as `data_prep.tables` writes it."""
+
+    format: int
+    key: str
+    files: str
+    data: dict[str, Any] | None
+    depth: str
+    options: dict[str, Any]
+    correction: str | None
+    frames: str
+    pair_files: str
+    split: str
+    sequences: _SequenceCounts
+    pairs: dict[str, int]
+    tables: dict[str, str]
+    """SHA-256 of each table's file."""
+    versions: dict[str, str | None]
 
 
 @dataclass(frozen=True)
@@ -120,7 +151,7 @@ class PreparedData:
     def open(cls, folder: Path) -> "PreparedData":
         """Open a finished preparation; raises InputError where it is missing or damaged."""
         manifest = read_manifest(folder)
-        tables = {name: _read_table(folder, name) for name in ("sequences", "frames", "pairs")}
+        tables = {name: _read_table(folder, name, manifest) for name in TABLES}
         try:
             return cls(
                 folder,
@@ -129,7 +160,7 @@ class PreparedData:
                 tables["frames"],
                 tables["pairs"].to_pandas(),
             )
-        except (KeyError, ValueError) as error:
+        except (KeyError, ValueError, TypeError, IndexError) as error:
             raise _damaged(folder, f"a column is missing or odd: {error}") from None
 
     def pairs(self, split: str) -> Pairs:
@@ -201,24 +232,23 @@ class PreparedData:
 
     def _open_flows(self, sequence: str) -> np.ndarray:
         folder = pairs_folder(self._pairs_root, sequence, self.roles[sequence])
-        try:
-            return np.load(folder / FLOWS, mmap_mode="r")
-        except (OSError, ValueError, EOFError) as error:
-            raise _damaged(folder, str(error)) from None
+        grid = self.manifest["options"].get("correction_grid")
+        flows = _mapped(folder / FLOWS, folder)
+        if flows.shape[1:] != (2, grid, grid) or flows.dtype != np.float16:
+            raise _damaged(folder, f"flows are {flows.shape}")
+        return flows
 
     def _open_arrays(self, sequence: str) -> Arrays:
         is_lone = self.roles[sequence] == "train and test"
         folder = frames_folder(self._frames_root, sequence, is_lone)
         count = self._rows[sequence].stop - self._rows[sequence].start
         square = (count, self.image_size, self.image_size)
-        try:
-            images, depths, masks = (
-                np.load(folder / name, mmap_mode="r") for name in (IMAGES, DEPTHS, MASKS)
-            )
-        except (OSError, ValueError, EOFError) as error:
-            raise _damaged(folder, str(error)) from None
+        images, depths, masks = (_mapped(folder / name, folder) for name in (IMAGES, DEPTHS, MASKS))
+        kinds = (images.dtype, depths.dtype, masks.dtype)
         if images.shape != (*square, 3) or depths.shape != square or masks.shape != square:
             raise _damaged(folder, f"frames are not {square}")
+        if kinds != (np.uint8, np.float16, np.uint8):
+            raise _damaged(folder, "frames are of other types")
         return images, depths, masks
 
     def __reduce__(self) -> tuple[Callable[[Path], "PreparedData"], tuple[Path]]:
@@ -229,31 +259,50 @@ class PreparedData:
 def read_manifest(folder: Path) -> dict[str, Any]:
     """What a folder was prepared from; raises InputError where that is missing or damaged."""
     file = folder / "manifest.json"
-    try:
-        manifest = json.loads(file.read_bytes())
-    except FileNotFoundError:
-        raise InputError(f"{folder}: holds no finished preparation; run data_prep again") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise _damaged(folder, f"{file}: {error}") from None
-    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+    if not file.is_file():
+        raise InputError(f"{folder}: holds no finished preparation; run data_prep again")
+    manifest = read_record(file, _Manifest, _REMEDY)
+    size = manifest.options.get("image_size")
+    if manifest.format != FORMAT or type(size) is not int:
         raise _damaged(folder, f"{file} is no manifest of format {FORMAT}")
-    return manifest
+    return asdict(manifest)
 
 
-def _read_table(folder: Path, name: str) -> pa.Table:
+def table_digest(file: Path) -> str:
+    """SHA-256 of a table's file; empty if it cannot be read."""
+    try:
+        with file.open("rb") as content:
+            return hashlib.file_digest(content, "sha256").hexdigest()
+    except OSError:
+        return ""
+
+
+def _read_table(folder: Path, name: str, manifest: dict[str, Any]) -> pa.Table:
+    """A table as it was written: what is damaged is never parsed."""
     file = folder / f"{name}.parquet"
+    if table_digest(file) != manifest["tables"].get(name):
+        raise _damaged(folder, f"{file} is missing or was changed")
     try:
         words = [name for name in _REPEATED if name in pq.read_schema(file).names]
         return pq.read_table(file, read_dictionary=words).combine_chunks()
-    except (OSError, pa.ArrowInvalid) as error:
+    except (OSError, pa.ArrowException) as error:
         reason = str(error).splitlines()[0]
         raise _damaged(folder, f"{file}: {reason}") from None
 
 
 def _damaged(folder: Path, what: str) -> InputError:
-    return InputError(
-        f"{folder} is damaged ({what}); run data_prep again, which makes anew what is damaged"
-    )
+    return InputError(f"{folder} is damaged ({what}); {_REMEDY}")
+
+
+def _mapped(file: Path, folder: Path) -> np.ndarray:
+    """An array on disk, of which no more is asked for than the file holds."""
+    try:
+        mapped: np.ndarray = np.load(file, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError, TypeError, OverflowError) as error:
+        raise _damaged(folder, f"{file.name}: {' '.join(str(error).split())[:200]}") from None
+    if not isinstance(mapped, np.memmap):  # a zip archive
+        raise _damaged(folder, f"{file.name} is no array")
+    return mapped
 
 
 def _roles(sequences: pd.DataFrame) -> dict[str, str]:

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import torch
 from hypothesis import given, settings
@@ -146,17 +147,57 @@ def test_damage_is_one_line(folder: Path, name: str, content: bytes) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_column_is_damage(folder: Path) -> None:
-    import pyarrow.parquet as pq
-
+@pytest.mark.parametrize("change", ["column", "bit"])
+def test_a_table_that_was_changed_is_damage_and_is_not_parsed(folder: Path, change: str) -> None:
     file = folder / "frames.parquet"
-    whole = pq.read_table(file)
-    pq.write_table(whole.drop_columns(["intrinsics"]), file)
+    whole = file.read_bytes()
+    if change == "column":
+        pq.write_table(pq.read_table(file).drop_columns(["intrinsics"]), file)
+    else:
+        file.write_bytes(whole[:-20] + bytes([whole[-20] ^ 1]) + whole[-19:])
     try:
-        with pytest.raises(InputError, match=r"damaged.*intrinsics"):
+        with pytest.raises(InputError, match=r"damaged.*frames\.parquet"):
             PreparedData.open(folder)
     finally:
-        pq.write_table(whole, file)
+        file.write_bytes(whole)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"options": {"image_size": 10**9}},
+        {"options": {"image_size": "large"}},
+        {"options": []},
+        {"frames": 5},
+        {"tables": {}},
+        {"sequences": {"kept": "4", "dropped": 0, "failed": 0}},
+        {"format": 3},
+    ],
+)
+def test_a_manifest_of_other_types_or_sizes_is_damage(folder: Path, change: dict) -> None:
+    file = folder / "manifest.json"
+    whole = file.read_text()
+    file.write_text(json.dumps(json.loads(whole) | change))
+    try:
+        with pytest.raises(InputError, match="damaged"):
+            PreparedData.open(folder).frames("cup/d", [0])
+    finally:
+        file.write_text(whole)
+
+
+@pytest.mark.parametrize("name", ["images.npy", "depth.npy", "mask.npy"])
+@pytest.mark.parametrize("shape", ["(4000000, 2000, 2000, 3)", "(2,)", "(-1, 5)", "0" * 99])
+def test_an_array_that_says_another_size_is_damage(folder: Path, name: str, shape: str) -> None:
+    """Before memory of that size is asked for."""
+    file = folder / "frames" / "cup" / "d" / name
+    whole = file.read_bytes()
+    header = f"{{'descr': '|u1', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
+    file.write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header.encode())
+    try:
+        with pytest.raises(InputError, match="damaged"):
+            PreparedData.open(folder).frames("cup/d", [0])
+    finally:
+        file.write_bytes(whole)
 
 
 def test_a_truncated_frame_file_is_damage(folder: Path) -> None:
