@@ -50,6 +50,7 @@ from extrap_train.reconstruction.planner import Query, expected_order, orbit_que
 from extrap_train.reconstruction.pose_check import check_poses
 from extrap_train.reconstruction.viewer import CloudViewer
 from extrap_train.store.cache import claim
+from extrap_train.store.outcome import Outcome
 from extrap_train.tasks.completed import Completed, write_completed
 from extrap_train.tasks.scene_content import scene_manifest
 from extrap_train.tasks.scene_folder import require_space, result_folder
@@ -101,7 +102,7 @@ class _Job:
         return {} if self.used is None else self.used.inputs()
 
 
-def run(config: TrainConfig) -> Path:
+def run(config: TrainConfig) -> Outcome:
     """Complete a scene; a second run resumes after the last whole view, or says that it is done."""
     job = _job(config)
     console = terminal()
@@ -109,8 +110,7 @@ def run(config: TrainConfig) -> Path:
     with claim(job.folder, manifest, resume=config.resume) as result:
         if not result.is_reused:
             result.begin()
-        _run(job, console)
-    return job.folder
+        return Outcome(job.folder, _run(job, console))
 
 
 def _job(config: TrainConfig) -> _Job:
@@ -146,7 +146,8 @@ def _check_category(config: TrainConfig, sequence: Sequence) -> None:
     terminal().print(f"the scene is of category {own}, not {chosen}")
 
 
-def _run(job: _Job, console: Console) -> None:
+def _run(job: _Job, console: Console) -> bool:
+    """Whether every view was there already."""
     workshop = _workshop(job)
     known = _started_map(job, workshop, console)
     queries = _queries(job, known)
@@ -157,7 +158,7 @@ def _run(job: _Job, console: Console) -> None:
     console.print(_plan_text(known, order))
     if job.config.complete.dry_run:
         console.print(f"plan: {job.folder / 'plan.png'}; nothing was generated")
-        return
+        return False
     missing = _count_missing(known, queries)
     require_space(job.folder, missing * view_bytes(workshop.generator.warp_size))
     with _viewer(job, known, console) as viewer:
@@ -170,6 +171,7 @@ def _run(job: _Job, console: Console) -> None:
         }
         done = Completed(known, steps, job.unit, job.truth, seconds)
         write_completed(done, job.config, job.sequence, workshop, job.used, job.folder, console)
+    return not missing
 
 
 def _count_missing(known: GlobalMap, queries: List[Query]) -> int:

@@ -35,6 +35,7 @@ from extrap_train.pictures import contact_sheet, curve, error_map, mark_holes
 from extrap_train.store.atomic import write_atomic
 from extrap_train.store.cache import Claim, claim
 from extrap_train.store.digests import file_digest
+from extrap_train.store.outcome import Outcome
 from extrap_train.store.records import read_record
 from extrap_train.tasks.results import without_nan
 from extrap_train.tasks.scene_content import photograph_digests, scene_manifest
@@ -62,7 +63,7 @@ _PICTURES_BYTES = 2**20
 """About what tables and pictures take on the disk beside the adapter."""
 
 
-def run(config: TrainConfig) -> Path:
+def run(config: TrainConfig) -> Outcome:
     """Train an adapter for `minutes`; leave it with its numbers and pictures.
 
     What the input views leave over of the scene is held out: the model is measured there with and
@@ -82,12 +83,13 @@ def run(config: TrainConfig) -> Path:
     options = _options(config) | model_options(config)
     manifest = scene_manifest(config, read, used.inputs() | _lpips_digest(config), options)
     with nothing_kept(), claim(folder, manifest, resume=config.resume) as result:
-        if result.is_reused and _is_whole(folder):
+        is_reused = result.is_reused and _is_whole(folder)
+        if is_reused:
             console.print("already adapted with these options, photographs and weights")
         else:
             _run(config, sequence, result, used, console)
     console.print(f"result: {folder}")
-    return folder
+    return Outcome(folder, is_reused)
 
 
 def _run(
