@@ -37,6 +37,30 @@ def test_verify_finds_a_forged_number_truth_and_protocol(copy: Path) -> None:
     assert any("not what its hash" in problem for problem in verify(folder).problems)
 
 
+@pytest.mark.parametrize(("metric", "change"), [("psnr", 3e-3), ("psnr", -3e-3), ("tsed", 1e-5)])
+def test_a_number_that_rounding_does_not_explain_is_noticed(
+    copy: Path, metric: str, change: float
+) -> None:
+    """By three ten-thousandths of about 10 dB, and by less where the number is 0."""
+    file = next(copy.glob("greys/cells/*/cell.json"))
+    record = json.loads(file.read_text())
+    record["metrics"][metric]["value"] += change
+    file.write_text(json.dumps(record))
+    assert any(
+        f"{metric} is stated as" in problem for problem in verify(greys_folder(copy)).problems
+    )
+
+
+def test_a_number_that_another_processor_rounds_otherwise_is_no_problem(copy: Path) -> None:
+    files = list(copy.glob("greys/cells/*/cell.json"))
+    for file in files:
+        record = json.loads(file.read_text())
+        record["metrics"]["psnr"]["value"] *= 1 + 1e-5
+        file.write_text(json.dumps(record))
+    problems = verify(greys_folder(copy)).problems
+    assert not any("is stated as" in problem for problem in problems)
+
+
 def test_verify_finds_what_is_left_out_and_what_only_pictures_show(copy: Path) -> None:
     folder = greys_folder(copy)
     files = sorted(copy.glob("greys/cells/*/cell.json"))

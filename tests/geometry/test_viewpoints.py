@@ -14,6 +14,7 @@ from extrap_train.geometry.viewpoints import (
     fit_orbit,
     nearest_references,
     pairwise_angles,
+    references_by_nearness,
     scene_center,
 )
 from extrap_train.views import Camera
@@ -103,6 +104,13 @@ def test_nearly_collinear_positions_have_a_finite_orbit() -> None:
 
 def test_nearest_references_come_in_order_with_ties_by_index() -> None:
     assert nearest_references(np.array([0.3, 0.1, 0.3, 0.2]), 3).tolist() == [1, 3, 0]
+
+
+@pytest.mark.parametrize("radius", [0.3, 1.0, 3.7])
+def test_the_reference_at_the_querys_place_is_the_nearest(radius: float) -> None:
+    """However its cosine is rounded: a little more than 1 has no angle."""
+    camera = ring(even(90), 25, radius)
+    assert references_by_nearness(camera, camera)[:, 0].tolist() == list(range(90))
 
 
 @given(st.integers(0, 1000), st.integers(1, 6))

@@ -121,6 +121,24 @@ def test_not_a_number_is_not_drawn():
     assert all(x.grad.isfinite().all() for x in inputs)
 
 
+def test_mean_depth_and_background_have_the_gradients_of_brute_force():
+    gaussians, pose = random_gaussians(20, seed=3), camera_pose()
+    ours, theirs = leaves(gaussians, pose, torch.float32), leaves(gaussians, pose, torch.float64)
+    shade = torch.tensor([0.3, 0.6, 0.9])
+    shades = [shade.clone().requires_grad_(), shade.double().requires_grad_()]
+    image, alpha, _ = draw(ours, mode="RGB+ED", degree=0, background=shades[0][None])
+    truth = draw_brute_force(theirs, 0, shades[1])
+    mean = truth[..., 3:4] / truth[..., 4:].clamp(min=1e-10)
+    truth = torch.cat([truth[..., :3], mean, truth[..., 4:]], -1)
+    drawn = torch.cat([image, alpha], -1)[0]
+    weight = torch.rand(drawn.shape, generator=torch.Generator().manual_seed(5)) - 0.3
+    (drawn * weight).sum().backward()
+    (truth * weight.double()).sum().backward()
+    for a, b in zip([*ours, shades[0]], [*theirs, shades[1]], strict=True):
+        assert (a.grad - b.grad).abs().max() <= 1e-3 * b.grad.abs().max()
+
+
+@pytest.mark.slow  # compiles every kernel for double precision, which nothing else uses
 def test_gradcheck_in_double_precision():
     gaussians = random_gaussians(3, degree=1, seed=3)
     inputs = leaves(gaussians, camera_pose(), torch.float64)
