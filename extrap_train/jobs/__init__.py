@@ -9,6 +9,9 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar, runtime_checkable
 
+ONE_THREAD = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+"""What tells the libraries of a worker process how many threads they have, before they load."""
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 

@@ -2,32 +2,36 @@
 
 import multiprocessing
 import os
+import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import Connection
 from multiprocessing.connection import wait as wait_for_any
 from types import TracebackType
 
-from extrap_train.jobs import Died, Item, Result
+from extrap_train.jobs import ONE_THREAD, Died, Item, Result
 
 WAITING_PER_WORKER = 2
 """Jobs that are handed out ahead of time: memory must not grow with the number of jobs."""
 _NO_MEMORY = "out of memory ({})"
-_ONE_THREAD = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 
 
 class LocalLauncher:
     """A pool of processes of one thread each, or just this process where `workers` is 1.
 
     A context manager: the pool starts with the first jobs, serves any number of runs, and ends
-    with the context. No worker outlives its parent, however that ends. `apart` keeps jobs out of
+    with the context, at once where it ends with an exception. No worker outlives its parent,
+    however that ends. `apart` keeps jobs out of
     this process even where one worker would do, so that one that dies takes only itself along.
     """
 
     def __init__(self, workers: int, apart: bool = False) -> None:
         self.workers, self.apart = workers, apart
         self._pool: ProcessPoolExecutor | None = None
+        self._stay: Connection | None = None
+        """Workers leave at once when it is closed."""
 
     def __enter__(self) -> "LocalLauncher":
         return self
@@ -38,6 +42,8 @@ class LocalLauncher:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        if kind is not None and self._stay is not None:
+            self._stay.close()
         self._close()
 
     def run(
@@ -105,10 +111,10 @@ class LocalLauncher:
             except BrokenProcessPool:
                 self._close()
         # Spawned, not forked: the parent may hold threads and a GPU.
+        context = multiprocessing.get_context("spawn")
+        leave, self._stay = context.Pipe(duplex=False)
         self._pool = ProcessPoolExecutor(
-            self.workers,
-            mp_context=multiprocessing.get_context("spawn"),
-            initializer=_prepare_worker,
+            self.workers, mp_context=context, initializer=_prepare_worker, initargs=(leave,)
         )
         return self._pool.submit(job, item)
 
@@ -118,14 +124,17 @@ class LocalLauncher:
             self._pool = None
 
 
-def _prepare_worker() -> None:
-    """One thread a worker, and no worker without its parent: a killed run leaves none behind."""
-    os.environ |= dict.fromkeys(_ONE_THREAD, "1")
+def _prepare_worker(leave: Connection) -> None:
+    """One thread per worker, and no worker without its parent: it leaves when that has died or is
+    interrupted, and is deaf to the Ctrl-C that reaches both.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.environ |= dict.fromkeys(ONE_THREAD, "1")
     parent = multiprocessing.parent_process()
     assert parent is not None
 
     def follow() -> None:
-        wait_for_any([parent.sentinel])
+        wait_for_any([parent.sentinel, leave])
         os._exit(1)
 
     threading.Thread(target=follow, daemon=True).start()
