@@ -13,10 +13,12 @@ from typing import Any, TypeVar, cast
 import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from pydantic import TypeAdapter, ValidationError
 
 import conf
 from extrap_train.config import MethodConfig, TableConfig, dotted
 from extrap_train.errors import InputError, did_you_mean
+from extrap_train.store.records import read_yaml
 
 T = TypeVar("T")
 
@@ -57,7 +59,7 @@ class Catalogue:
 
     def reported(self, name: str) -> dict[str, Any]:
         """Published numbers by name: `source`, and `rows` of method, views, metric and value."""
-        return cast(dict[str, Any], yaml.safe_load(self._file("reported", name).read_text()))
+        return read_yaml(self._file("reported", name), "correct it")
 
     def _file(self, kind: str, name: str) -> Path:
         for folder in reversed(self.folders):
@@ -67,21 +69,28 @@ class Catalogue:
 
 
 def _typed(kind: type[T], name: str, file: Path, overrides: Sequence[str]) -> T:
-    """The file over the dataclass's defaults, the overrides over both."""
+    """The file over the dataclass's defaults, the overrides over both; nothing in them is
+    interpolated.
+    """
     wrong = [word for word in overrides if "=" not in word]
     if wrong:
         raise InputError(f"{wrong[0]!r} is no key=value")
     try:
-        content = OmegaConf.create(file.read_text())
+        content = read_yaml(file, "correct it")
         given = OmegaConf.from_dotlist(list(overrides))
         merged = OmegaConf.merge(OmegaConf.structured(kind), {"name": name}, content, given)
         missing = sorted(map(str, OmegaConf.missing_keys(merged)))
         if missing:
             raise InputError(f"{file}: does not say {missing[0]}; add it")
-        return cast(T, OmegaConf.to_object(merged))
+        values = OmegaConf.to_container(merged, resolve=False)
+        return TypeAdapter(kind).validate_python(values)
+    except InputError:
+        raise
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        reason = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        raise InputError(f"{' '.join([str(file), *overrides])}: {reason}") from None
     except (OmegaConfBaseException, yaml.YAMLError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
         reason = " ".join(str(error).splitlines()[:1])
         raise InputError(f"{_blame(kind, file, overrides)}: {reason}") from None
 

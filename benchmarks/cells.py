@@ -2,145 +2,106 @@
 whole or not at all; a finished one is never changed.
 
 <key>/cell.json, 0.png …   (the target images, in the order of the protocol's targets)
+
+First the method makes the images, in a process of its own and without any truth (`making`); what
+it hands out is let in (`door`) and kept. Later the images are scored.
 """
 
 import hashlib
-import os
-import shutil
-import traceback
+import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from benchmarks.files import images_of, json_bytes
-from benchmarks.making import MEASURED, Made, make
-from benchmarks.methods.base import Unavailable
+from benchmarks.cell_job import CellJob
+from benchmarks.door import LetIn
+from benchmarks.files import npy_bytes, png_bytes
 from benchmarks.provenance import versions
+from benchmarks.records import FAILED, OK, Cell, files_of, read_cell
 from benchmarks.scenes import Scene
-from benchmarks.scoring import Score, score_files
-from extrap_train.config import MethodConfig, ScoringConfig
-from extrap_train.data.json_files import read_json
-from extrap_train.store.atomic import write_atomic
+from benchmarks.words import one_line
+from extrap_train.errors import InputError
+from extrap_train.store.atomic import atomic_folder
+from extrap_train.store.records import write_record
 
-OK, FAILED, UNAVAILABLE = "ok", "failed", "unavailable"
 _DRAW = ("category", "sequence", "n_views", "draw", "seed")
+_CARRIED = (
+    "versions", "seconds", "wall_seconds", "peak_memory_mib", "given", "counts", "truths_apart",
+)  # fmt: skip
+"""What a cell takes over from another with the very same images."""
 
 
-@dataclass(frozen=True)
-class CellJob:
-    """All that a worker needs to make one cell."""
+def _record(
+    job: CellJob, status: Literal["ok", "failed", "unavailable", "made"], reason: str = ""
+) -> Cell:
+    """A record that holds what the job says."""
+    return Cell(
+        key=job.folder.name,
+        method=job.method.name,
+        options=dict(job.method.options),
+        scene=job.scene.name,
+        device=job.device,
+        hashes=job.hashes,
+        status=status,
+        reason=reason,
+        versions=versions(),
+        **{name: getattr(job.draw, name) for name in _DRAW},
+    )
 
-    folder: Path
-    """Its name is the key."""
-    scene: Path
-    method: MethodConfig
-    scoring: ScoringConfig
-    device: str
-    hashes: Mapping[str, str]
-    """`protocol`, `rules`, `data`, `method`, `code`, `weights`, `images` (all that decides the
-    images) and `scoring`.
-    """
-    images_from: Path | None = None
-    """A finished cell with the very same images, which only need scoring again."""
+
+def keep(job: CellJob, result: LetIn, truths_apart: bool) -> Cell:
+    """Write the cell of what a method has made, unscored, or of why it has not."""
+    handed = result.handed
+    record = replace(_record(job, handed.status, handed.reason), traceback=handed.traceback)
+    images = {f"{index}.png": png_bytes(pixels) for index, pixels in enumerate(result.images)}
+    points = {}
+    if result.points is not None:
+        points["points.npy"] = npy_bytes(torch.from_numpy(result.points))
+    if handed.measured is not None:
+        record = replace(record, truths_apart=truths_apart, **asdict(handed.measured))
+    return write_cell(job.folder, record, images, points)
 
 
-def run_cell(job: CellJob) -> dict[str, Any]:
-    """Make, score and write a cell; whatever goes wrong becomes its status, with the reason."""
-    torch.set_num_threads(1)  # the same images, however many workers there are
-    if job.device != "cuda":  # before anything asks for a GPU: from then on it is there
-        os.environ["CUDA_VISIBLE_DEVICES"] = ""
-    scene = Scene.open(job.scene)
-    record = _head(job, scene)
-    files: dict[str, bytes] = {}
+def score_cell(job: CellJob) -> Cell:
+    """Score and write a cell whose images are there; what cannot be scored is a failure."""
+    torch.set_num_threads(1)
+    from benchmarks.scoring import score_files  # heavy, and only those who score need it
+
+    assert job.images_from is not None
+    started = time.perf_counter()
+    made = read_cell(job.images_from)
+    if made is None:
+        raise InputError(f"{job.images_from}: is gone; run the table again")
+    images, points = (files_of(job.images_from, kind) for kind in (made.images, made.points))
+    record = replace(_record(job, OK), **{name: getattr(made, name) for name in _CARRIED})
     try:
-        made = _made(job, scene)
-        scores = score_files(made.images, made.points, scene.truth(), job.scoring)
-        record |= {
-            "status": OK,
-            "reason": "",
-            **made.measured,
-            "metrics": {name: asdict(score) for name, score in scores.items()},
-            "images": _hashes(made.images),
-            "points": _hashes(made.points),
-        }
-        files = made.images | made.points
-    except Unavailable as error:
-        record |= {"status": UNAVAILABLE, "reason": str(error)}
-    except Exception as error:
-        record |= {
-            "status": FAILED,
-            "reason": f"{type(error).__name__}: {' '.join(str(error).split())[:300]}",
-            "traceback": traceback.format_exc(),
-        }
-    write_cell(job.folder, record, files)
+        scores = score_files(job.images_from, images, points, Scene.open(job.scene), job.scoring)
+        took = time.perf_counter() - started
+        record = replace(record, metrics=scores, scoring_seconds=took)
+    except ValueError as error:
+        record = replace(record, status=FAILED, reason=one_line(f"not scored: {error}"))
+    return write_cell(job.folder, record, images, points)
+
+
+def fail(job: CellJob, reason: str) -> Cell:
+    """Write the cell of a job whose process ended without a record."""
+    return write_cell(job.folder, _record(job, FAILED, reason), {}, {})
+
+
+def write_cell(
+    folder: Path, record: Cell, images: Mapping[str, bytes], points: Mapping[str, bytes]
+) -> Cell:
+    """Put a cell in its place; what stood there (a failed or an unscored one) goes."""
+    record = replace(record, images=_hashes(images), points=_hashes(points))
+    with atomic_folder(folder) as made:
+        for name, content in {**images, **points}.items():
+            (made / name).write_bytes(content)
+        write_record(made / "cell.json", record)
     return record
 
 
 def _hashes(files: Mapping[str, bytes]) -> dict[str, str]:
     return {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
-
-
-def read_cell_files(folder: Path, record: Mapping[str, Any], kind: str) -> dict[str, bytes]:
-    """The `images` or `points` of a finished cell."""
-    return {name: (folder / name).read_bytes() for name in record.get(kind, {})}
-
-
-def died_record(job: CellJob, reason: str) -> dict[str, Any]:
-    """The record of a cell whose process ended without one."""
-    record = _head(job, Scene.open(job.scene)) | {"status": FAILED, "reason": reason}
-    write_cell(job.folder, record, {})
-    return record
-
-
-def _head(job: CellJob, scene: Scene) -> dict[str, Any]:
-    draw = scene.draw
-    return {
-        "key": job.folder.name,
-        "method": job.method.name,
-        "options": dict(job.method.options),
-        **{name: getattr(draw, name) for name in _DRAW},
-        "scene": job.scene.name,
-        "device": job.device,
-        "hashes": dict(job.hashes),
-        "versions": versions(),
-    }
-
-
-def _made(job: CellJob, scene: Scene) -> Made:
-    if job.images_from is None:
-        return make(job.method, scene)
-    before = read_json(job.images_from / "cell.json")
-    return Made(
-        {name: before[name] for name in MEASURED},
-        read_cell_files(job.images_from, before, "images"),
-        read_cell_files(job.images_from, before, "points"),
-    )
-
-
-def read_cell_images(folder: Path, record: Mapping[str, Any]) -> Float[Tensor, "n 3 h w"]:
-    """The saved images of a finished cell, in the targets' order."""
-    return images_of(read_cell_files(folder, record, "images"))
-
-
-def write_cell(folder: Path, record: Mapping[str, Any], files: Mapping[str, bytes]) -> None:
-    """Write beside the final place and rename; what stood there (a failed cell) goes."""
-    workshop = folder.with_name(f".{folder.name}.{os.getpid()}")
-    shutil.rmtree(workshop, ignore_errors=True)
-    try:
-        for name, content in files.items():
-            write_atomic(workshop / name, content)
-        write_atomic(workshop / "cell.json", json_bytes(record))
-        shutil.rmtree(folder, ignore_errors=True)
-        workshop.replace(folder)
-    finally:
-        shutil.rmtree(workshop, ignore_errors=True)
-
-
-def scores_of(record: Mapping[str, Any]) -> dict[str, Score]:
-    """A finished cell's metrics."""
-    return {name: Score(**entry) for name, entry in record.get("metrics", {}).items()}

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from benchmarks.chance import FEWEST_CAPTURES, chance, is_beyond_chance, mean_interval
 from benchmarks.columns import direction
 from benchmarks.plan import TableFolder
+from benchmarks.records import Cell
 from benchmarks.results import MEASURED, UNIT, Results, by_capture, read_results
 from extrap_train.errors import InputError
 
@@ -25,17 +26,17 @@ def compare(before: TableFolder, after: TableFolder) -> pd.DataFrame:
 
 
 def compare_results(one: Results, two: Results) -> pd.DataFrame:
-    """A row a method, draw, number of views and metric: both means over the cells that both have,
-    the paired difference with its 95 % interval over captures, the `chance` of it, a verdict, and
-    whether both were scored alike (`same`, or `other`: other weights of the networks, options or
-    code, so that a change may be the judges' and not the method's).
+    """One row per method, draw, number of views and metric: both means over the cells that both
+    have, the paired difference with its 95 % interval over captures, the `chance` of it, a verdict,
+    and whether both were scored alike (`same`, or `other`: other weights of the networks, options
+    or code, so that a change may be the judges' and not the method's).
 
     Raises InputError where the two are of different protocols, or of different data.
     """
-    if one.plan["protocol"] != two.plan["protocol"]:
+    if one.plan.protocol != two.plan.protocol:
         raise InputError(
             f"{one.folder.path} and {two.folder.path} are of different protocols "
-            f"({one.plan['protocol'][:12]}, {two.plan['protocol'][:12]}): no number of one can be "
+            f"({one.plan.protocol[:12]}, {two.plan.protocol[:12]}): no number of one can be "
             "set against the other's"
         )
     _require_same_data(one, two)
@@ -85,18 +86,18 @@ def _verdict(difference: Float[np.ndarray, " n"], p: float, sign: int) -> str:
 
 def _require_same_data(one: Results, two: Results) -> None:
     """A protocol names frames: what they show is another hash."""
-    known = {_draw(cell): cell["hashes"]["data"] for cell in one.cells}
+    known = {_draw(cell): cell.hashes.data for cell in one.cells}
     for cell in two.cells:
-        if known.get(_draw(cell), cell["hashes"]["data"]) != cell["hashes"]["data"]:
+        if known.get(_draw(cell), cell.hashes.data) != cell.hashes.data:
             raise InputError(
                 f"{one.folder.path} and {two.folder.path} hold different photographs or "
-                f"cameras of {cell['scene']}: no number of one can be set against the other's"
+                f"cameras of {cell.scene}: no number of one can be set against the other's"
             )
 
 
 def _scorings(results: Results) -> dict[tuple[Any, ...], str]:
-    return {(cell["method"], *_draw(cell)): cell["hashes"]["scoring"] for cell in results.cells}
+    return {(cell.method, *_draw(cell)): cell.hashes.scoring for cell in results.cells}
 
 
-def _draw(cell: dict[str, Any]) -> tuple[Any, ...]:
-    return tuple(cell[name] for name in (*UNIT, "n_views"))
+def _draw(cell: Cell) -> tuple[Any, ...]:
+    return tuple(getattr(cell, name) for name in (*UNIT, "n_views"))

@@ -1,9 +1,11 @@
-"""Files as results are written and read: JSON of the same bytes for the same content, pictures,
-clouds.
+"""Pictures and arrays of results, as they are written and read: what is read may come from
+elsewhere, and is refused before memory is asked for.
 """
 
 import io
 import json
+import math
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,9 +17,12 @@ from PIL import Image
 from plyfile import PlyData, PlyParseError
 from torch import Tensor
 
-from extrap_train.data.images import ARRAY_ERRORS, to_eight_bits
-from extrap_train.data.picture_files import DECODER_ERRORS, is_readable_size
+from extrap_train.data.picture_files import DECODER_ERRORS
 from extrap_train.errors import InputError
+
+MAX_POINTS = 50_000_000
+_PLY_HEADER_BYTES = 2**16
+_COUNTS = re.compile(rb"^element\s+\S+\s+(\d+)", re.MULTILINE)
 
 
 def json_bytes(content: Any) -> bytes:
@@ -25,29 +30,32 @@ def json_bytes(content: Any) -> bytes:
     return (json.dumps(content, indent=1, allow_nan=False) + "\n").encode()
 
 
-def png_bytes(image: Float[Tensor, "3 h w"]) -> bytes:
-    """An image in [0, 1] as an 8-bit PNG."""
+def png_bytes(pixels: UInt8[np.ndarray, "h w 3"]) -> bytes:
+    """A picture as a PNG."""
     content = io.BytesIO()
-    Image.fromarray(to_eight_bits(image.permute(1, 2, 0))).save(content, "png")
+    Image.fromarray(pixels).save(content, "png")
     return content.getvalue()
 
 
-def images_of(pictures: Mapping[str, bytes]) -> Float[Tensor, "n 3 h w"]:
-    """Images of one size from the contents of PNG files, by name: 8 bits there, here in [0, 1]."""
-    arrays = [_decode_png(name, content) for name, content in pictures.items()]
-    if len({array.shape for array in arrays}) != 1:
-        raise InputError(f"{', '.join(pictures)}: expected images of one size; make the cell again")
-    return torch.from_numpy(np.stack(arrays)).permute(0, 3, 1, 2).float() / 255
+def pictures_of(pictures: Mapping[Path, bytes], side: int) -> Float[Tensor, "n 3 side side"]:
+    """The pictures in files of `png_bytes`, colours in [0, 1]; InputError for any others."""
+    pixels = [_decoded(content, side, file) for file, content in pictures.items()]
+    return torch.from_numpy(np.stack(pixels)).permute(0, 3, 1, 2).float() / 255
 
 
-def _decode_png(name: str, content: bytes) -> UInt8[np.ndarray, "h w 3"]:
+def _decoded(content: bytes, side: int, file: Path) -> UInt8[np.ndarray, "side side 3"]:
     try:
-        picture = Image.open(io.BytesIO(content), formats=("PNG",))
-        if picture.mode == "RGB" and is_readable_size(picture):
+        with Image.open(io.BytesIO(content), formats=("PNG",)) as picture:
+            if (picture.size, picture.mode) != ((side, side), "RGB"):
+                raise InputError(
+                    f"{file}: is a picture of {picture.width} × {picture.height} px and mode "
+                    f"{picture.mode}, not of {side} × {side} and RGB; run the table again"
+                )
             return np.array(picture)
+    except InputError:
+        raise
     except DECODER_ERRORS:
-        pass
-    raise InputError(f"{name}: is no PNG picture in 8-bit RGB; make the cell again")
+        raise InputError(f"{file}: is no PNG picture; run the table again") from None
 
 
 def npy_bytes(values: Tensor) -> bytes:
@@ -57,22 +65,42 @@ def npy_bytes(values: Tensor) -> bytes:
     return content.getvalue()
 
 
-def array_of(content: bytes) -> Tensor:
-    """The array that a file of `npy_bytes` holds."""
+def array_of(content: bytes, shape: tuple[int | None, ...], file: Path) -> Tensor:
+    """The array in a file of `npy_bytes`, of this shape, where None is any length.
+
+    Raises InputError for any other content, and for numbers that are not finite.
+    """
+    stream = io.BytesIO(content)
     try:
-        array = np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
-        return torch.from_numpy(array.astype(np.float32, copy=False))
-    except ARRAY_ERRORS as error:
-        raise InputError(
-            f"an array of a result is damaged ({error}); make its cell again"
-        ) from None
+        version = np.lib.format.read_magic(stream)
+        if version != (1, 0):
+            raise ValueError("another version of the format")
+        found, is_fortran, dtype = np.lib.format.read_array_header_1_0(stream)
+        rest = len(content) - stream.tell()
+        fits = len(found) == len(shape) and all(
+            want in (None, have) for want, have in zip(shape, found, strict=True)
+        )
+        if dtype != np.float32 or is_fortran or not fits or rest != 4 * math.prod(found):
+            raise ValueError(f"{dtype} of shape {found}")
+    except (ValueError, SyntaxError, EOFError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{file}: is no such array ({reason}); run the table again") from None
+    values = torch.from_numpy(np.frombuffer(stream.read(), np.float32).copy())
+    if not values.isfinite().all():
+        raise InputError(f"{file}: holds numbers that are not finite; run the table again")
+    return values.reshape(found)
 
 
 def read_points(path: Path) -> Float[Tensor, "m 3"]:
     """The points of a PLY file."""
     try:
+        with path.open("rb") as file:
+            header = file.read(_PLY_HEADER_BYTES).partition(b"end_header")[0]
+        count = max(map(int, _COUNTS.findall(header)), default=0)
+        if count > min(MAX_POINTS, path.stat().st_size):
+            raise ValueError(f"its header states {count:,} elements")
         vertices = PlyData.read(path)["vertex"]
         columns = [np.asarray(vertices[axis], np.float32) for axis in ("x", "y", "z")]
-    except (OSError, PlyParseError, KeyError, ValueError) as error:
+    except (OSError, PlyParseError, KeyError, ValueError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: no points can be read ({error}); restore the file") from None
     return torch.from_numpy(np.stack(columns, 1))

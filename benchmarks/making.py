@@ -1,71 +1,84 @@
-"""Making a cell's images: a method is given a scene's inputs, and what it makes becomes files.
-
-Only what this module imports decides images; a change in how they are scored leaves them alone.
+"""A method at work, in a process of its own: it is given a scene's inputs, and what it makes is
+handed out as bytes (`benchmarks.door`).
 """
 
-from dataclasses import dataclass
+import os
+import random
+import traceback
 from typing import Any
 
+import numpy as np
 import torch
+from torch import Tensor
 
-from benchmarks.files import npy_bytes, png_bytes
+from benchmarks.cell_job import CellJob
+from benchmarks.door import Handed, measured_of, packed
 from benchmarks.memory import PeakMemory
-from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis
+from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis, Unavailable
 from benchmarks.methods.build import build_method
 from benchmarks.recorded_depth import RecordedDepth
+from benchmarks.records import FAILED, MADE, UNAVAILABLE
 from benchmarks.scenes import Scene
 from extrap_train.config import MethodConfig
+from extrap_train.data.images import to_eight_bits
 from extrap_train.errors import InputError
 from extrap_train.metrics import require_unit_range
 
 PER_IMAGE = "per image"
 """`MethodConfig.time` of the methods whose perform time is that of one image."""
-MEASURED = ("seconds", "wall_seconds", "peak_memory_mib", "given", "counts")
-"""What a record keeps of the making, apart from its files."""
 
 
-@dataclass(frozen=True)
-class Made:
-    """What a method has made of a scene, as it is kept."""
-
-    measured: dict[str, Any]
-    """The entries of `MEASURED`."""
-    images: dict[str, bytes]
-    """PNG files by name, in the order of the targets."""
-    points: dict[str, bytes]
-    """One file of the reconstructed surface, where the method has any."""
-
-
-def make(method: MethodConfig, scene: Scene) -> Made:
-    """Run a method on what it may know of a scene; InputError where it makes other images than it
-    was asked for.
-    """
-    inputs = scene.inputs()
-    with PeakMemory() as memory, Stopwatch() as watch:
-        synthesis = _synthesize(method, inputs)
-    points = synthesis.points
-    return Made(
-        measured={
-            "seconds": synthesis.seconds + _depth_share(inputs, method),
-            "wall_seconds": watch.seconds,
-            "peak_memory_mib": memory.mib,
-            "given": dict(synthesis.given),
-            "counts": dict(synthesis.counts),
-        },
-        images={f"{i}.png": png_bytes(image) for i, image in enumerate(synthesis.images)},
-        points={} if points is None else {"points.npy": npy_bytes(points)},
-    )
+def make(job: CellJob) -> bytes:
+    """Run a method on what it may know of a scene; whatever it raises is its status and reason."""
+    torch.set_num_threads(1)  # the same images, however many workers there are
+    if job.device != "cuda":  # before anything asks for a GPU: from then on it is there
+        os.environ["CUDA_VISIBLE_DEVICES"] = ""
+    try:
+        inputs = Scene.open(job.scene).inputs()
+        with PeakMemory() as memory, Stopwatch() as watch:
+            synthesis = _synthesize(job.method, inputs)
+        return _handed(synthesis, inputs, job.method, watch.seconds, memory.mib)
+    except Unavailable as error:
+        return packed(Handed(UNAVAILABLE, str(error)))
+    except BaseException as error:  # SystemExit and KeyboardInterrupt are its own, too
+        reason = f"{type(error).__name__}: {error}"
+        return packed(Handed(FAILED, reason, traceback.format_exc()))
 
 
 def _synthesize(method: MethodConfig, inputs: SceneInputs) -> Synthesis:
-    torch.manual_seed(inputs.seed)
-    synthesis = build_method(method).synthesize(inputs)
-    wanted = (len(inputs.targets.world_to_cam), 3, inputs.targets.height, inputs.targets.width)
-    if tuple(synthesis.images.shape) != wanted:
-        found = tuple(synthesis.images.shape)
-        raise InputError(f"method {method.name}: made images {found}, asked were {wanted}")
-    require_unit_range(synthesis.images)
-    return synthesis
+    for seed in (random.seed, np.random.seed, torch.manual_seed):
+        seed(inputs.seed)
+    return build_method(method).synthesize(inputs)
+
+
+def _handed(
+    synthesis: Synthesis,
+    inputs: SceneInputs,
+    method: MethodConfig,
+    wall_seconds: float,
+    peak_memory_mib: float | None,
+) -> bytes:
+    images, points = synthesis.images, synthesis.points
+    _require_floats(images, f"method {method.name}: images")
+    require_unit_range(images)
+    arrays = {"images": to_eight_bits(images.permute(0, 2, 3, 1))}
+    if points is not None:
+        _require_floats(points, f"method {method.name}: points")
+        arrays["points"] = points.detach().cpu().float().numpy()
+    values = {
+        "seconds": synthesis.seconds + _depth_share(inputs, method),
+        "wall_seconds": wall_seconds,
+        "peak_memory_mib": peak_memory_mib,
+        "given": dict(synthesis.given),
+        "counts": dict(synthesis.counts),
+    }
+    return packed(Handed(MADE, measured=measured_of(values, method.name)), arrays)
+
+
+def _require_floats(values: Any, what: str) -> None:
+    if not (isinstance(values, Tensor) and values.is_floating_point()):
+        kind = values.dtype if isinstance(values, Tensor) else type(values).__name__
+        raise InputError(f"{what} must be a tensor of floats, not {kind}")
 
 
 def _depth_share(inputs: SceneInputs, method: MethodConfig) -> float:

@@ -1,22 +1,23 @@
 """From a table to its cells: protocol, prepared draws, and what each cell is named by."""
 
 import inspect
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
 
 from benchmarks.backbones import judging_files
 from benchmarks.captures import Capture, freeze, open_captures
-from benchmarks.cells import CellJob
+from benchmarks.cell_job import CellJob
 from benchmarks.fingerprint import code_hash, weights_hash
 from benchmarks.method_checks import method_hash, require_different, require_options_fit
 from benchmarks.methods.base import Unavailable
 from benchmarks.methods.build import build_method
 from benchmarks.protocol import Draw, Protocol, digest
+from benchmarks.records import Hashes
 from benchmarks.scene_writing import prepare_scene
-from benchmarks.scenes import Scene
+from benchmarks.scenes import Scene, truths_of
 from benchmarks.training import trained_models
 from extrap_train.config import MethodConfig, TableConfig
 from extrap_train.data.frame_files import sequence_folder
@@ -47,6 +48,11 @@ class TableFolder:
     def scenes(self) -> Path:
         """A folder a prepared draw."""
         return self.path / "scenes"
+
+    @property
+    def truths(self) -> Path:
+        """What the images of those draws are scored against; not there while methods run."""
+        return truths_of(self.scenes)
 
     def scene(self, draw: Draw) -> Path:
         """Where a draw is prepared; its capture's name is untrusted and leads nowhere else."""
@@ -178,34 +184,38 @@ def cell_jobs(
     jobs = []
     for scene in scenes:
         for method in methods:
-            hashes = parts[method.name, scene.draw.category] | {
-                "data": scene.data_hash,
-                "device": device,
-            }
-            hashes["rules"] = digest(asdict(protocol.rules))
-            hashes |= {"images": images_hash(hashes), "scoring": scoring}
-            key = cell_key(hashes)
+            hashes = Hashes(
+                protocol=protocol.sha256,
+                rules=digest(asdict(protocol.rules)),
+                data=scene.data_hash,
+                device=device,
+                images="",
+                scoring=scoring,
+                **parts[method.name, scene.draw.category],
+            )
+            hashes = replace(hashes, images=images_hash(hashes))
             jobs.append(
                 CellJob(
-                    folder=folder.cells / key,
+                    folder=folder.cells / cell_key(hashes),
                     scene=scene.folder,
+                    draw=scene.draw,
                     method=method,
                     scoring=table.scoring,
                     device=device,
-                    hashes=hashes | {"protocol": protocol.sha256},
+                    hashes=hashes,
                 )
             )
     return jobs
 
 
-def images_hash(hashes: Mapping[str, str]) -> str:
+def images_hash(hashes: Hashes) -> str:
     """Of all that decides a cell's images."""
-    return digest({name: hashes[name] for name in _IMAGES})
+    return digest({name: getattr(hashes, name) for name in _IMAGES})
 
 
-def cell_key(hashes: Mapping[str, str]) -> str:
+def cell_key(hashes: Hashes) -> str:
     """A cell's name: of its images' hash and its scoring's."""
-    return digest([hashes["images"], hashes["scoring"]])[:KEY_LENGTH]
+    return digest([hashes.images, hashes.scoring])[:KEY_LENGTH]
 
 
 def _method_hashes(method: MethodConfig, category: str) -> dict[str, str]:

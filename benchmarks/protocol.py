@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Float
 
 from extrap_train.config import RulesConfig
-from extrap_train.data.json_files import read_json
 from extrap_train.errors import InputError
 from extrap_train.geometry.viewpoints import (
     camera_centers,
@@ -23,6 +22,7 @@ from extrap_train.geometry.viewpoints import (
     scene_center,
 )
 from extrap_train.store.atomic import write_atomic
+from extrap_train.store.records import read_record
 from extrap_train.views import Camera
 
 FORMAT = 1
@@ -72,20 +72,24 @@ class Protocol:
     @classmethod
     def read(cls, file: Path) -> "Protocol":
         """A frozen protocol; raises InputError where its content is not what its hash says."""
-        content = read_json(file)
-        try:
-            rules = RulesConfig(**content["rules"])
-            draws = tuple(draw_of(entry) for entry in content["draws"])
-            stated = content["sha256"]
-        except (TypeError, KeyError, ValueError) as error:
-            raise InputError(f"{file}: is no protocol ({error!r}); delete it") from None
-        protocol = cls(rules, draws)
-        if content.get("format") != FORMAT or protocol.sha256 != stated:
+        content = read_record(file, ProtocolRecord, "delete it with the results beside it")
+        protocol = cls(content.rules, tuple(content.draws))
+        if content.format != FORMAT or protocol.sha256 != content.sha256:
             raise InputError(
-                f"{file}: its content is not what its hash {stated[:12]} says; restore the file, "
-                "or delete it with the results beside it"
+                f"{file}: its content is not what its hash {content.sha256[:12]!a} says; restore "
+                "the file, or delete it with the results beside it"
             )
         return protocol
+
+
+@dataclass(frozen=True)
+class ProtocolRecord:
+    """A frozen protocol, `protocol.json`."""
+
+    format: int
+    rules: RulesConfig
+    draws: list[Draw]
+    sha256: str
 
 
 def digest(content: Any) -> str:
@@ -157,9 +161,3 @@ def _one_sided(angles: Float[np.ndarray, "n n"], rng: np.random.Generator) -> li
 
 
 _ORDERS = {"random": _random, "spread": _spread, "one_sided": _one_sided}
-
-
-def draw_of(entry: dict[str, Any]) -> Draw:
-    """A draw from its JSON."""
-    lists = {name: tuple(entry[name]) for name in ("inputs", "targets")}
-    return Draw(**{**entry, **lists})

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchmarks.cells import OK
 from benchmarks.chance import chance, is_beyond_chance, mean_interval
 from benchmarks.columns import direction
 from benchmarks.plan import TableFolder
-from benchmarks.records import planned_cells, read_plan
+from benchmarks.records import OK, Cell, Plan, planned_cells, read_plan
 from benchmarks.scenes import Scene
+from extrap_train.config import MethodConfig
 from extrap_train.errors import InputError
 
 TIDY = [
@@ -36,45 +36,52 @@ class Results:
     """The cells of a table as it was last run."""
 
     folder: TableFolder
-    plan: dict[str, Any]
-    cells: list[dict[str, Any]]
+    plan: Plan
+    cells: list[Cell]
 
     @property
-    def methods(self) -> dict[str, dict[str, Any]]:
-        """Title, group and meaning of time by method, in the table's order."""
-        return dict(self.plan["methods"])
+    def methods(self) -> dict[str, MethodConfig]:
+        """By name, in the table's order."""
+        return self.plan.methods
 
     @cached_property
     def tidy(self) -> pd.DataFrame:
-        """A row a cell and metric; an empty value has its status and reason."""
+        """One row per cell and metric; an empty value has its status and reason."""
         rows = []
         for cell in self.cells:
-            head = {name: cell[name] for name in ("method", *UNIT, "n_views")}
-            state = {"status": cell["status"], "reason": cell["reason"]}
-            if cell["status"] != OK:
+            head = {name: getattr(cell, name) for name in ("method", *UNIT, "n_views")}
+            state = {"status": cell.status, "reason": cell.reason}
+            if cell.status != OK:
                 rows.append({**head, "metric": "", "value": np.nan, **state})
                 continue
-            for metric, score in cell["metrics"].items():
-                reason = {"reason": score["reason"]}
-                rows.append({**head, "metric": metric, "value": score["value"], **state, **reason})
-            rows += [{**head, "metric": name, "value": cell[name], **state} for name in MEASURED]
+            for metric, score in cell.metrics.items():
+                reason = {"reason": score.reason}
+                rows.append({**head, "metric": metric, "value": score.value, **state, **reason})
+            rows += [
+                {**head, "metric": name, "value": getattr(cell, name), **state} for name in MEASURED
+            ]
         table = pd.DataFrame(rows, columns=TIDY)
         return table.assign(value=table["value"].astype(float))
 
     @cached_property
     def by_image(self) -> pd.DataFrame:
-        """A row a target image and metric, with its angle to the nearest input in degrees."""
+        """One row per target image and metric, with its angle to the nearest input in degrees."""
         rows = []
         for cell in self.cells:
-            if cell["status"] != OK:
+            if cell.status != OK:
                 continue
-            scene = Scene.open(self.folder.scenes / cell["scene"])
-            angles = np.degrees(scene.angles_rad)
-            for metric, score in cell["metrics"].items():
-                for index, value in enumerate(score["per_image"]):
+            scene = Scene.open(self.folder.scenes / cell.scene)
+            angles = np.degrees(scene.record.angles_rad)
+            for metric, score in cell.metrics.items():
+                if len(score.per_image) not in (0, len(angles)):
+                    raise InputError(
+                        f"{self.folder.cells / cell.key}: has another number of {metric} than of "
+                        "targets; run the table again"
+                    )
+                for index, value in enumerate(score.per_image):
                     rows.append(
                         {
-                            **{name: cell[name] for name in ("method", *UNIT, "n_views")},
+                            **{name: getattr(cell, name) for name in ("method", *UNIT, "n_views")},
                             "target": scene.draw.targets[index],
                             "angle_deg": angles[index],
                             "metric": metric,
@@ -85,9 +92,9 @@ class Results:
         return pd.DataFrame(rows, columns=columns)
 
     def means(self, category: str | None = None) -> pd.DataFrame:
-        """A row a method, draw, number of views and metric: mean over captures with its interval,
-        the count of captures, of cells and of those that any method has, rank, the paired test
-        against the best (`p_best`), and whether the method is worse beyond chance.
+        """One row per method, draw, number of views and metric: mean over captures with its
+        interval, the count of captures, of cells and of those that any method has, rank, the
+        paired test against the best (`p_best`), and whether the method is worse beyond chance.
 
         A method that lacks cells has no rank: its mean is of other captures. Where most methods
         lack some, none has: who is best would be a matter of who is left.

@@ -1,55 +1,58 @@
 """Which cells of a table need not be made again, or only scored."""
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from benchmarks.cells import OK, CellJob
+from benchmarks.cell_job import CellJob
 from benchmarks.plan import TableFolder
-from benchmarks.records import read_record
+from benchmarks.records import OK, Cell, read_cell
 from extrap_train.errors import InputError
 
 
-def finished(
-    jobs: list[CellJob], folder: TableFolder, say: Callable[[str], None]
-) -> tuple[list[CellJob], list[CellJob]]:
-    """The jobs that are done and those that are to be run, the latter with images to score again
-    where only the scoring has changed. Damaged cells are announced and made anew.
-    """
-    done, open_jobs = [], []
+@dataclass(frozen=True)
+class Open:
+    """The jobs of a table by what is left to do."""
+
+    done: list[CellJob]
+    to_make: list[CellJob]
+    to_score: list[CellJob]
+    """They know where the images are that their method has made."""
+
+
+def sort_jobs(jobs: list[CellJob], folder: TableFolder, say: Callable[[str], None]) -> Open:
+    """Look what is there; damaged cells are announced and made again."""
+    sorted_jobs = Open([], [], [])
+    rest = []
     for job in jobs:
-        record = _record(job.folder, say)
-        if record is not None and record["status"] == OK:
-            done.append(job)
+        cell = _cell(job.folder, say)
+        if cell is not None and cell.status == OK:
+            sorted_jobs.done.append(job)
         else:
-            open_jobs.append(job)
-    if open_jobs:
-        images = _finished_images(folder, {job.folder for job in jobs})
-        open_jobs = [_with_images(job, images.get(job.hashes["images"])) for job in open_jobs]
-    return done, open_jobs
+            rest.append(job)
+    images = _images(folder) if rest else {}
+    for job in rest:
+        there = images.get(job.hashes.images)
+        if there is None:
+            sorted_jobs.to_make.append(job)
+        else:
+            sorted_jobs.to_score.append(replace(job, images_from=there))
+    return sorted_jobs
 
 
-def _record(folder: Path, say: Callable[[str], None]) -> dict[str, object] | None:
+def _cell(folder: Path, say: Callable[[str], None]) -> Cell | None:
     try:
-        return read_record(folder)
+        return read_cell(folder)
     except InputError as error:
-        say(f"{error}: made anew")
+        say(f"{error}: made again")
         return None
 
 
-def _finished_images(folder: TableFolder, current: set[Path]) -> dict[str, Path]:
-    """Cells of other scorings by what decides their images."""
+def _images(folder: TableFolder) -> dict[str, Path]:
+    """Cells that hold images, by what decides those."""
     found: dict[str, Path] = {}
-    for cell in folder.cells.glob("*/cell.json"):
-        if cell.parent in current:
-            continue
-        try:
-            record = read_record(cell.parent)
-        except InputError:
-            continue
-        if record is not None and record["status"] == OK:
-            found[record["hashes"]["images"]] = cell.parent
+    for file in folder.cells.glob("*/cell.json"):
+        cell = _cell(file.parent, lambda _: None)
+        if cell is not None and cell.images:
+            found[cell.hashes.images] = file.parent
     return found
-
-
-def _with_images(job: CellJob, images_from: Path | None) -> CellJob:
-    return CellJob(**{**vars(job), "images_from": images_from})

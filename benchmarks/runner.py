@@ -1,39 +1,42 @@
-"""Run a table: what is missing is made, what is there is used, and the reports are written."""
+"""Run a table: what is missing is made and scored, what is there is used, reports are written."""
 
 import os
-import time
+import shutil
 from collections import defaultdict
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, nullcontext
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
-from rich.live import Live
 
 from benchmarks.backbones import judging_hashes
 from benchmarks.catalogue import Catalogue
-from benchmarks.cells import FAILED, OK, CellJob, died_record, run_cell
-from benchmarks.files import json_bytes
-from benchmarks.plan import (
-    TableFolder,
-    cell_jobs,
-    open_protocol,
-    prepare_draws,
-    selected_draws,
-)
-from benchmarks.progress import Progress, print_plan
-from benchmarks.protocol import Protocol
+from benchmarks.cell_job import CellJob
+from benchmarks.cells import fail, keep, score_cell
+from benchmarks.door import let_in
+from benchmarks.estimate import print_plan
+from benchmarks.making import make
+from benchmarks.plan import TableFolder, cell_jobs, open_protocol, prepare_draws, selected_draws
+from benchmarks.records import FAILED, MADE, OK, Cell, Plan
 from benchmarks.results import read_results
-from benchmarks.reuse import finished
-from extrap_train.config import MethodConfig, SlurmConfig, TableConfig
+from benchmarks.reuse import sort_jobs
+from benchmarks.scenes import Scene
+from benchmarks.truths import put_away
+from extrap_train.config import MethodConfig, TableConfig
 from extrap_train.errors import InputError
 from extrap_train.jobs import Died, Launcher
+from extrap_train.jobs.guests import AsGuest, GuestLauncher
 from extrap_train.jobs.local import LocalLauncher
 from extrap_train.jobs.slurm import slurm_launcher
-from extrap_train.store.atomic import file_lock, write_atomic
-from extrap_train.terminal import terminal
+from extrap_train.store.atomic import file_lock, remove_leftovers
+from extrap_train.store.records import write_record
+from extrap_train.terminal import progress, terminal
+
+_CELLS_PER_SCORER = 8
+Making = Callable[[Sequence[CellJob]], Iterator[tuple[int, bytes | Died]]]
+"""Runs `make` on every job, and gives each one's index with what it handed out."""
 
 
 @dataclass(frozen=True)
@@ -54,23 +57,28 @@ def run_table(table: TableConfig, catalogue: Catalogue, options: RunOptions) -> 
 
     Raises InputError where another run holds the folder, or where the table cannot be made.
     """
-    console = terminal()
     folder = TableFolder(Path(table.output) / table.name)
-    _make_folder(folder)
+    with _held(folder):
+        return _run(table, catalogue, options, folder, terminal())
+
+
+@contextmanager
+def _held(folder: TableFolder) -> Iterator[None]:
+    """The folder for this process alone, without what killed runs have left in it."""
     taken = f"{folder.path}: another process runs this table; wait for it or give output=FOLDER"
-    with file_lock(folder.path / ".lock", taken):
-        return _run(table, catalogue, options, folder, console)
-
-
-def _make_folder(folder: TableFolder) -> None:
-    try:
-        folder.path.mkdir(parents=True, exist_ok=True)
-        (folder.path / ".writable").touch()
-        (folder.path / ".writable").unlink()
-    except OSError as error:
-        raise InputError(
-            f"{folder.path}: cannot be written ({error.strerror}); choose another output="
-        ) from None
+    with ExitStack() as held:
+        try:
+            folder.path.mkdir(parents=True, exist_ok=True)
+            held.enter_context(file_lock(folder.path / ".run.lock", taken))
+        except OSError as error:
+            raise InputError(
+                f"{folder.path}: cannot be written ({error.strerror}); choose another output="
+            ) from None
+        remove_leftovers(folder.path)
+        for place in (folder.cells, folder.scenes, folder.truths):
+            for left in filter(Path.is_dir, place.glob(".*")):  # nobody else writes here
+                shutil.rmtree(left)
+        yield
 
 
 def _run(
@@ -85,52 +93,43 @@ def _run(
         raise InputError("the table has no methods: give methods=[...]")
     protocol, captures = open_protocol(table, folder, methods)
     draws = selected_draws(table, protocol, options.quick)
-    scenes = []
-    with console.status("") as status:
-        for number, scene in enumerate(prepare_draws(table, folder, draws, captures)):
+    scenes: list[Scene] = []
+    with progress("preparing", len(draws), "draws") as bar:
+        for scene in prepare_draws(table, folder, draws, captures):
             scenes.append(scene)
-            status.update(f"preparing draws: {number + 1} of {len(draws)}")
+            bar.advance()
     jobs = cell_jobs(table, folder, protocol, methods, scenes)
-    done, waiting = finished(jobs, folder, console.print)
-    console.print(f"{len(jobs)} cells: {len(done)} finished and used again, {len(waiting)} open")
+    left = sort_jobs(jobs, folder, console.print)
+    still = len(left.to_make) + len(left.to_score)
+    console.print(f"{len(jobs)} cells: {len(left.done)} finished and used again, {still} open")
     if options.dry_run:
-        print_plan(jobs, waiting, folder, console)
+        print_plan(jobs, left, folder, console)
         return 0
-    plan = _plan(table, options, protocol, methods, jobs)
-    progress = Progress(len(jobs))
-    for job in done:
-        progress.note(job.method.name, OK)
-    problems = _make(waiting, table, options, folder, progress, console)
-    write_atomic(folder.plan, json_bytes(plan))
-    # Light to import only where it is needed: the reports draw.
-    from benchmarks.report import write_reports
-
-    results = read_results(folder)
-    written = write_reports(results, catalogue, folder)
-    for reason, names in problems.items():
-        console.print(f"{len(names)} cells of {', '.join(sorted(set(names)))}: {reason}")
-    for path in written:
-        console.print(f"written: {path}")
-    console.print(f"result: {folder.path}")
-    return sum(1 for cell in results.cells if cell["status"] == FAILED)
-
-
-def _plan(
-    table: TableConfig,
-    options: RunOptions,
-    protocol: Protocol,
-    methods: list[MethodConfig],
-    jobs: list[CellJob],
-) -> dict[str, Any]:
-    """What the results are of: all that reports and verification ask beside the cells."""
-    return {
-        "table": asdict(table),
-        "quick": options.quick,
-        "protocol": protocol.sha256,
-        "networks": judging_hashes(table.scoring),
-        "methods": {method.name: asdict(method) for method in methods},
-        "cells": [job.folder.name for job in jobs],
-    }
+    plan = Plan(
+        table=table,
+        quick=options.quick,
+        protocol=protocol.sha256,
+        networks=dict(judging_hashes(table.scoring)),
+        methods={method.name: method for method in methods},
+        cells=[job.folder.name for job in jobs],
+    )
+    try:
+        with _launchers(options, table, jobs, folder) as (making, scoring):
+            made = _make(left.to_make, making, folder)
+            images = [
+                replace(job, images_from=job.folder)
+                for job, cell in zip(left.to_make, made, strict=True)
+                if cell.images
+            ]
+            scored = _score([*left.to_score, *images], scoring)
+    except KeyboardInterrupt:
+        kept = sum((job.folder / "cell.json").is_file() for job in jobs)
+        raise KeyboardInterrupt(
+            f"{kept} of {len(jobs)} cells are kept in {folder.path}; run the same command again "
+            "to go on"
+        ) from None
+    write_record(folder.plan, plan)
+    return _report(folder, catalogue, [*made, *scored], console)
 
 
 def _with_options(catalogue: Catalogue, name: str, table: TableConfig) -> MethodConfig:
@@ -138,43 +137,76 @@ def _with_options(catalogue: Catalogue, name: str, table: TableConfig) -> Method
     return replace(method, options={**method.options, **table.options.get(name, {})})
 
 
-def _make(
-    waiting: list[CellJob],
-    table: TableConfig,
-    options: RunOptions,
-    folder: TableFolder,
-    progress: Progress,
-    console: Console,
-) -> dict[str, list[str]]:
-    """Run the open cells; returns the methods' names by what went wrong."""
-    problems: dict[str, list[str]] = defaultdict(list)
-    if not waiting:
-        return problems
-    started = time.perf_counter()
+def _make(jobs: Sequence[CellJob], making: Making, folder: TableFolder) -> list[Cell]:
+    """Let the methods make their images, and keep what is sound; a cell per job, in their order."""
+    cells: dict[int, Cell] = {}
     with (
-        _launcher(options, table.slurm, waiting[0].device, folder) as launcher,
-        Live(progress.view(len(waiting), 0.0, 0), console=console) as live,
+        put_away(folder.truths) if jobs else nullcontext(),
+        progress("making", len(jobs), "cells") as bar,
     ):
-        for number, (index, result) in enumerate(launcher.run(run_cell, waiting), 1):
-            job = waiting[index]
-            record = died_record(job, result.reason) if isinstance(result, Died) else result
-            progress.note(job.method.name, record["status"])
-            if record["status"] != OK:
-                problems[record["reason"]].append(job.method.name)
-            elapsed = time.perf_counter() - started
-            live.update(progress.view(len(waiting) - number, elapsed, number))
-    return problems
+        for index, result in making(jobs):
+            job = jobs[index]
+            scene = Scene.open(job.scene)
+            size = scene.record.image_size
+            let = let_in(result, len(scene.draw.targets), size, job.method.name)
+            cells[index] = keep(job, let, truths_apart=True)
+            bar.advance(note=f"{job.method.name} {_word(cells[index])}")
+    return [cells[index] for index in range(len(jobs))]
+
+
+def _word(cell: Cell) -> str:
+    return cell.status if cell.status != FAILED else f"failed: {cell.reason}"
+
+
+def _score(jobs: Sequence[CellJob], launcher: Launcher) -> list[Cell]:
+    """Score what is made, and put the cells in their places."""
+    cells = []
+    with progress("scoring", len(jobs), "cells") as bar:
+        for index, result in launcher.run(score_cell, jobs):
+            if isinstance(result, Died):
+                result = fail(jobs[index], result.reason)
+            cells.append(result)
+            bar.advance()
+    return cells
+
+
+def _report(
+    folder: TableFolder, catalogue: Catalogue, fresh: Sequence[Cell], console: Console
+) -> int:
+    """Write the reports and print the numbers; returns how many cells have failed."""
+    from benchmarks.report import laid_out, numbers, write_reports  # heavy: they draw
+
+    results = read_results(folder)
+    layout = laid_out(results, catalogue)
+    written = write_reports(results, layout, folder)
+    console.print(f"\n{numbers(layout, console.width)}\n")
+    problems: dict[str, list[str]] = defaultdict(list)
+    for cell in fresh:
+        if cell.status not in (OK, MADE):
+            problems[cell.reason].append(cell.method)
+    for reason, names in problems.items():
+        console.print(f"{len(names)} cells of {', '.join(sorted(set(names)))}: {reason}")
+    for path in written:
+        console.print(f"written: {path}")
+    console.print(f"result: {folder.path}")
+    return sum(cell.status == FAILED for cell in results.cells)
 
 
 @contextmanager
-def _launcher(
-    options: RunOptions, slurm: SlurmConfig, device: str, folder: TableFolder
-) -> Iterator[Launcher]:
-    if options.launcher is not None:
-        yield options.launcher
-    elif options.slurm:
-        yield slurm_launcher(slurm, folder.path / "slurm")
-    else:
-        cores = 1 if device == "cuda" else len(os.sched_getaffinity(0))
-        with LocalLauncher(options.workers or cores, apart=True) as local:
-            yield local
+def _launchers(
+    options: RunOptions, table: TableConfig, jobs: Sequence[CellJob], folder: TableFolder
+) -> Iterator[tuple[Making, Launcher]]:
+    """What makes images, each cell's in a process of its own, and what scores them."""
+    modules = {job.method.factory.rpartition(".")[0] for job in jobs}
+    ours = sorted(name for name in modules if name.startswith("benchmarks."))
+    preload = ("benchmarks.making", *ours)
+    if options.launcher is not None or options.slurm:
+        elsewhere = options.launcher or slurm_launcher(table.slurm, folder.path / "slurm")
+        yield partial(elsewhere.run, AsGuest(make, table.cell_timeout_s, preload)), elsewhere
+        return
+    cores = 1 if jobs[0].device == "cuda" else len(os.sched_getaffinity(0))
+    workers = options.workers or cores
+    guests = GuestLauncher(workers, table.cell_timeout_s, preload)
+    # A further process loads for as long as it takes to score some cells here.
+    with LocalLauncher(min(workers, 1 + len(jobs) // _CELLS_PER_SCORER)) as local:
+        yield partial(guests.run, make), local

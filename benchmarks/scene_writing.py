@@ -2,29 +2,28 @@
 
 import hashlib
 import logging
-import os
-import shutil
 from collections.abc import Mapping
 from collections.abc import Sequence as ListOf
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from benchmarks.captures import Capture
-from benchmarks.files import json_bytes, npy_bytes, png_bytes
+from benchmarks.files import npy_bytes, png_bytes
 from benchmarks.methods.base import Stopwatch
 from benchmarks.protocol import Draw
-from benchmarks.scenes import FORMAT, Scene
+from benchmarks.records import SCENE_FORMAT, CameraRecord, Cameras, SceneRecord
+from benchmarks.scenes import INPUTS, Scene
 from extrap_train.config import DatasetDepthConfig, DepthConfig, RulesConfig, StereoConfig
+from extrap_train.data.images import to_eight_bits
 from extrap_train.data.module import with_warp
 from extrap_train.data.queries import query_batch
 from extrap_train.depth import NoDepthError
 from extrap_train.depth.build import depth_source
 from extrap_train.errors import InputError
 from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
-from extrap_train.store.atomic import write_atomic
+from extrap_train.store.atomic import atomic_folder
+from extrap_train.store.records import write_record
 from extrap_train.views import Camera, View, stack_cameras
 
 LOG = logging.getLogger(__name__)
@@ -35,39 +34,40 @@ DEPTHS: Mapping[str, DepthConfig] = {"dataset": DatasetDepthConfig(), "stereo": 
 def prepare_scene(
     folder: Path, capture: Capture, draw: Draw, rules: RulesConfig, origin: str
 ) -> Scene:
-    """Read a draw's frames and write its folder, or open the one that is there.
+    """Read a draw's frames and write its folder and its truth's, or open what is there.
 
-    `origin` names all that decides the content; a folder of another origin, with a changed file or
-    a damaged record, is made anew.
+    `origin` names all that decides the content; what is of another origin, or lacks or has changed
+    a file, is replaced.
     """
     there = _whole_scene(folder, origin)
     if there is not None:
         return there
-    workshop = folder.with_name(f".{folder.name}.{os.getpid()}")
-    shutil.rmtree(workshop, ignore_errors=True)
-    try:
-        record = _write_scene(workshop, capture, draw, rules)
-        write_atomic(workshop / "scene.json", json_bytes({**record, "origin": origin}))
-        shutil.rmtree(folder, ignore_errors=True)
-        workshop.replace(folder)
-    finally:
-        shutil.rmtree(workshop, ignore_errors=True)
+    contents, record = _scene(capture, draw, rules, origin)
+    truth = Scene(folder, record).truth_folder
+    for place, is_input in ((truth, False), (folder, True)):  # the record comes last
+        with atomic_folder(place) as made:
+            for name, content in contents.items():
+                if name.startswith(INPUTS) == is_input:
+                    (made / name).parent.mkdir(exist_ok=True)
+                    (made / name).write_bytes(content)
+            if is_input:
+                write_record(made / "scene.json", record)
     return Scene.open(folder)
 
 
 def _whole_scene(folder: Path, origin: str) -> Scene | None:
     """What is there already, if it is all there."""
-    if not (folder / "scene.json").is_file():
-        return None
     try:
         scene = Scene.open(folder)
-        same = scene.record["origin"] == origin and not scene.changed_files()
-    except (InputError, KeyError, TypeError, AttributeError):
+    except InputError:
         return None
-    return scene if same else None
+    return scene if scene.record.origin == origin and not scene.changed_files() else None
 
 
-def _write_scene(folder: Path, capture: Capture, draw: Draw, rules: RulesConfig) -> dict[str, Any]:
+def _scene(
+    capture: Capture, draw: Draw, rules: RulesConfig, origin: str
+) -> tuple[dict[str, bytes], SceneRecord]:
+    """A draw's files by name, and its record."""
     size = rules.image_size
     frames = {frame.name: frame for frame in capture.sequence.frames}
     missing = [name for name in (*draw.inputs, *draw.targets) if name not in frames]
@@ -90,7 +90,7 @@ def _write_scene(folder: Path, capture: Capture, draw: Draw, rules: RulesConfig)
         "masks": warp.mask[:, None].expand(-1, 3, -1, -1),
     }
     contents = {
-        f"{kind}/{i}.png": png_bytes(image)
+        f"{kind}/{i}.png": png_bytes(to_eight_bits(image.permute(1, 2, 0)))
         for kind, images in pictures.items()
         for i, image in enumerate(images)
     }
@@ -102,21 +102,21 @@ def _write_scene(folder: Path, capture: Capture, draw: Draw, rules: RulesConfig)
         surface = capture.surface()
         contents["truth/object.npy"] = npy_bytes(surface.object)
         contents["truth/surroundings.npy"] = npy_bytes(surface.surroundings)
-    for name, content in contents.items():
-        write_atomic(folder / name, content)
-    return {
-        "format": FORMAT,
-        "draw": asdict(draw),
-        "image_size": size,
-        "fine_size": fine_size,
-        "depth_seconds": seconds,
-        "cameras": {
-            "inputs": [_camera_record(view.camera.resized(size, size)) for view in inputs],
-            "targets": [_camera_record(view.camera) for view in targets],
-        },
-        "angles_rad": _angles_to_nearest([view.resized(size, size) for view in inputs], targets),
-        "files": {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()},
-    }
+    record = SceneRecord(
+        format=SCENE_FORMAT,
+        origin=origin,
+        draw=draw,
+        image_size=size,
+        fine_size=fine_size,
+        depth_seconds=seconds,
+        cameras=Cameras(
+            inputs=[_camera_record(view.camera.resized(size, size)) for view in inputs],
+            targets=[_camera_record(view.camera) for view in targets],
+        ),
+        angles_rad=_angles_to_nearest([view.resized(size, size) for view in inputs], targets),
+        files={name: hashlib.sha256(content).hexdigest() for name, content in contents.items()},
+    )
+    return contents, record
 
 
 def _fine_scale(photographs: ListOf[View], rules: RulesConfig) -> int:
@@ -153,8 +153,5 @@ def _angles_to_nearest(inputs: ListOf[View], targets: ListOf[View]) -> list[floa
     return [float(a) for a in angles[len(inputs) :, : len(inputs)].min(1)]
 
 
-def _camera_record(camera: Camera) -> dict[str, Any]:
-    return {
-        "world_to_cam": camera.world_to_cam.tolist(),
-        "intrinsics": camera.intrinsics.tolist(),
-    }
+def _camera_record(camera: Camera) -> CameraRecord:
+    return CameraRecord(camera.world_to_cam.tolist(), camera.intrinsics.tolist())

@@ -1,32 +1,33 @@
 """One draw on disk: what a method receives, and apart from it what its images are scored against.
 
-<folder>/scene.json            the draw, cameras, angles, hashes; written last
-         inputs/0.png …        inputs/depth.npy (0 = unknown; found from the inputs alone), at
-                               the finer size
-         truth/0.png …         truth/depth.npy, truth/object.npy and truth/surroundings.npy (points)
-                               where the capture knows them
-         warps/0.png …         masks/0.png …: the fused warp of all inputs, and what it reaches
+scenes/DRAW/scene.json      the draw, cameras, angles, hashes; written last
+            inputs/0.png …  inputs/depth.npy (0 = unknown; found from the inputs alone), at the
+                            finer size
+truths/DRAW/truth/0.png …   truth/depth.npy, truth/object.npy and truth/surroundings.npy (points)
+                            where the capture knows them
+            warps/0.png …   masks/0.png …: the fused warp of all inputs, and what it reaches
+
+While methods run, `truths` is not there (`benchmarks.truths`).
 """
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from benchmarks.files import array_of, pictures_of
 from benchmarks.methods.base import SceneInputs
-from benchmarks.protocol import Draw, digest, draw_of
+from benchmarks.protocol import Draw, digest
 from benchmarks.recorded_depth import RecordedDepth
-from extrap_train.data.images import read_image
-from extrap_train.data.json_files import read_json
+from benchmarks.records import CameraRecord, SceneRecord, plain, read_limited, sha256_of
 from extrap_train.errors import InputError
+from extrap_train.store.records import read_record
 from extrap_train.views import Camera, View
 
-FORMAT = 2
+INPUTS = "inputs/"
+"""What the names of files begin with that methods receive; all others are the truth's."""
 
 
 @dataclass(frozen=True)
@@ -57,46 +58,60 @@ class Scene:
     """One prepared draw."""
 
     folder: Path
-    record: dict[str, Any]
+    record: SceneRecord
 
     @classmethod
     def open(cls, folder: Path) -> "Scene":
         """A prepared draw; raises InputError where its record is missing or damaged."""
-        record = read_json(folder / "scene.json")
-        if not isinstance(record, dict) or record.get("format") != FORMAT:
-            raise InputError(f"{folder / 'scene.json'}: is no prepared scene; delete {folder}")
+        file = folder / "scene.json"
+        remedy = f"delete {folder} and run the table again"
+        record = read_record(file, SceneRecord, remedy)
+        draw, cameras = record.draw, record.cameras
+        views = (len(cameras.inputs), len(cameras.targets), len(record.angles_rad))
+        if views != (len(draw.inputs), len(draw.targets), len(draw.targets)) or 0 in views:
+            raise InputError(f"{file}: has other numbers of cameras than of frames; {remedy}")
+        needed = {*_pictures("inputs", draw.inputs), "inputs/depth.npy"}
+        needed |= {n for kind in ("truth", "warps", "masks") for n in _pictures(kind, draw.targets)}
+        if missing := needed - record.files.keys():
+            raise InputError(f"{file}: names no {min(missing)}; {remedy}")
         return cls(folder, record)
 
     @property
     def draw(self) -> Draw:
         """Which frames of which capture it holds."""
-        return draw_of(self.record["draw"])
+        return self.record.draw
 
     @property
     def data_hash(self) -> str:
         """Of every file and camera in it."""
-        return digest([self.record[name] for name in ("draw", "cameras", "files")])
+        record = self.record
+        return digest([plain(record.draw), plain(record.cameras), record.files])
 
     @property
-    def angles_rad(self) -> list[float]:
-        """Angle of every target to its nearest input, about the scene's centre."""
-        return list(self.record["angles_rad"])
+    def truth_folder(self) -> Path:
+        """Where the truth lies, except while methods run."""
+        return truths_of(self.folder.parent) / self.folder.name
+
+    def file(self, name: str) -> Path:
+        """Where one of its files lies."""
+        return (self.folder if name.startswith(INPUTS) else self.truth_folder) / name
 
     def changed_files(self) -> list[str]:
         """Files that are missing, or not what their hash says."""
         return [
             name
-            for name, stated in self.record["files"].items()
-            if not (self.folder / name).is_file() or _hash(self.folder / name) != stated
+            for name, stated in self.record.files.items()
+            if sha256_of(self.file(name)) != stated
         ]
 
     def inputs(self) -> SceneInputs:
         """What a method receives; nothing of the truth is read."""
-        draw = self.draw
-        cameras = self._cameras("inputs")
-        side, size = self.record["fine_size"], self.record["image_size"]
-        images = self._pictures("inputs", len(draw.inputs), side)
-        depths = torch.from_numpy(np.load(self.folder / "inputs" / "depth.npy"))
+        draw, record = self.draw, self.record
+        cameras = _camera(record.cameras.inputs, record.image_size)
+        side, size = record.fine_size, record.image_size
+        images = self._pictures("inputs", draw.inputs, side)
+        depths = self._array("inputs/depth.npy", (len(draw.inputs), side, side))
+        assert depths is not None
         fine = [
             View(image, cameras[i].resized(side, side), depths[i], name=draw.inputs[i])
             for i, image in enumerate(images)
@@ -104,48 +119,57 @@ class Scene:
         return SceneInputs(
             category=draw.category,
             views=tuple(view.resized(size, size) for view in fine),
-            targets=self._cameras("targets"),
-            depth_source=RecordedDepth(float(self.record["depth_seconds"])),
+            targets=self.target_cameras,
+            depth_source=RecordedDepth(record.depth_seconds),
             seed=draw.seed,
             fine_views=tuple(fine),
         )
 
+    @property
+    def target_cameras(self) -> Camera:
+        """Where views are to be made."""
+        return _camera(self.record.cameras.targets, self.record.image_size)
+
     def truth(self) -> Truth:
         """What the images are scored against."""
-        count = len(self.draw.targets)
+        frames, size = self.draw.targets, self.record.image_size
         return Truth(
-            images=self._pictures("truth", count),
-            cameras=self._cameras("targets"),
-            warps=self._pictures("warps", count),
-            masks=(self._pictures("masks", count)[:, 0] > 0.5).float(),
-            depths=self._array("truth/depth.npy"),
+            images=self._pictures("truth", frames, size),
+            cameras=self.target_cameras,
+            warps=self._pictures("warps", frames, size),
+            masks=(self._pictures("masks", frames, size)[:, 0] > 0.5).float(),
+            depths=self._array("truth/depth.npy", (len(frames), size, size)),
             surface=self._surface(),
         )
 
     def _surface(self) -> TrueSurface | None:
-        found = [self._array(f"truth/{name}.npy") for name in ("object", "surroundings")]
+        found = [self._array(f"truth/{kind}.npy", (None, 3)) for kind in ("object", "surroundings")]
         return None if found[0] is None or found[1] is None else TrueSurface(found[0], found[1])
 
-    def _pictures(self, kind: str, count: int, side: int | None = None) -> Float[Tensor, "n 3 h w"]:
-        size = (side or self.record["image_size"],) * 2
-        return torch.stack(
-            [read_image(self.folder / kind / f"{i}.png", size) for i in range(count)]
-        )
+    def _pictures(
+        self, kind: str, frames: tuple[str, ...], side: int
+    ) -> Float[Tensor, "n 3 side side"]:
+        files = map(self.file, _pictures(kind, frames))
+        return pictures_of({file: read_limited(file) for file in files}, side).contiguous()
 
-    def _array(self, name: str) -> Tensor | None:
-        path = self.folder / name
-        return torch.from_numpy(np.load(path)) if name in self.record["files"] else None
-
-    def _cameras(self, kind: str) -> Camera:
-        entries = self.record["cameras"][kind]
-        size = self.record["image_size"]
-        return Camera(
-            torch.tensor([entry["world_to_cam"] for entry in entries]),
-            torch.tensor([entry["intrinsics"] for entry in entries]),
-            size,
-            size,
-        )
+    def _array(self, name: str, shape: tuple[int | None, ...]) -> Tensor | None:
+        file = self.file(name)
+        return array_of(read_limited(file), shape, file) if name in self.record.files else None
 
 
-def _hash(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+def truths_of(scenes: Path) -> Path:
+    """The folder of the truths of a folder of scenes."""
+    return scenes.with_name("truths")
+
+
+def _pictures(kind: str, frames: tuple[str, ...]) -> list[str]:
+    return [f"{kind}/{index}.png" for index in range(len(frames))]
+
+
+def _camera(entries: list[CameraRecord], size: int) -> Camera:
+    return Camera(
+        torch.tensor([entry.world_to_cam for entry in entries]),
+        torch.tensor([entry.intrinsics for entry in entries]),
+        size,
+        size,
+    )

@@ -5,16 +5,17 @@ A metric without a value says why; no other network's number stands in for it.
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from functools import lru_cache
+from pathlib import Path
 
 from jaxtyping import Float
 from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from benchmarks.consistency import tsed, warp_psnr
-from benchmarks.files import array_of, images_of
-from benchmarks.scenes import Truth
+from benchmarks.files import array_of, pictures_of
+from benchmarks.records import Score
+from benchmarks.scenes import Scene, Truth
 from extrap_train.config import ScoringConfig
 from extrap_train.errors import InputError
 from extrap_train.metrics import (
@@ -32,16 +33,6 @@ _NO_SURFACE = "the capture's true surface is not known"
 _NO_DEPTH = "the capture has no true depth"
 _ALL_SEEN = "the inputs reach every pixel of every target"
 _NONE_SEEN = "the inputs reach no pixel of any target"
-
-
-@dataclass(frozen=True)
-class Score:
-    """A metric's mean over a cell's targets; None where it has none, and why."""
-
-    value: float | None
-    reason: str = ""
-    per_image: list[float | None] = field(default_factory=list)
-    """By target, where the metric is one of single images."""
 
 
 def score_images(
@@ -70,11 +61,21 @@ def score_images(
 
 
 def score_files(
-    images: Mapping[str, bytes], points: Mapping[str, bytes], truth: Truth, scoring: ScoringConfig
+    folder: Path,
+    images: Mapping[str, bytes],
+    points: Mapping[str, bytes],
+    scene: Scene,
+    scoring: ScoringConfig,
 ) -> dict[str, Score]:
-    """Every metric of a cell from its files."""
-    clouds = [array_of(content) for content in points.values()]
-    scores = score_images(images_of(images), truth, scoring)
+    """Every metric of a cell from its files, which lie in `folder`."""
+    names = [f"{index}.png" for index in range(len(scene.draw.targets))]
+    if list(images) != names or not points.keys() <= {"points.npy"}:
+        raise InputError(f"{folder}: holds other files than {names[0]} … {names[-1]}")
+    side = scene.record.image_size
+    pictures = pictures_of({folder / name: data for name, data in images.items()}, side)
+    clouds = [array_of(content, (None, 3), folder / name) for name, content in points.items()]
+    truth = scene.truth()
+    scores = score_images(pictures, truth, scoring)
     return scores | score_points(clouds[0] if clouds else None, truth)
 
 

@@ -13,11 +13,10 @@ from extrap_train.config import (
     SyntheticConfig,
     TableConfig,
 )
+from extrap_train.config.options import check_options
 from extrap_train.errors import InputError, did_you_mean
 
 DEPTHS = ("dataset", "stereo")
-SSIM_WINDOW = 11
-"""Pixels a side, which no image can be smaller than."""
 
 
 def check_table(table: TableConfig, catalogue: Catalogue) -> None:
@@ -35,7 +34,7 @@ def check_table(table: TableConfig, catalogue: Catalogue) -> None:
     for name in table.methods:
         catalogue.method(name)
     _require_once(table)
-    _require_bounds(table)
+    check_options(table)
     _require_held_out(table.captures)
     given = table.captures.source == "reconfusion"  # its files name inputs and targets
     if rules.draws != ["given"] if given else "given" in rules.draws:
@@ -91,22 +90,6 @@ def _require_once(table: TableConfig) -> None:
         twice = [word for index, word in enumerate(words) if word in words[:index]]
         if twice:
             raise InputError(f"{option}: {twice[0]} is there twice; leave one out")
-
-
-def _require_bounds(table: TableConfig) -> None:
-    least = {
-        "rules.image_size": (table.rules.image_size, SSIM_WINDOW),
-        "rules.fine_scale": (table.rules.fine_scale, 1),
-        "rules.pool": (table.rules.pool, 2),
-        "captures.sequences": (table.captures.sequences, 1),
-        "captures.frames": (table.captures.frames, 1),
-        "captures.render_size": (table.captures.render_size, 1),
-        "quick.sequences": (table.quick.sequences, 1),
-        "rules.seeds": (min(table.rules.seeds, default=0), 0),
-    }
-    for option, (value, bound) in least.items():
-        if value < bound:
-            raise InputError(f"{option}={value}: must be at least {bound}")
 
 
 def _require_held_out(captures: CapturesConfig) -> None:

@@ -1,21 +1,19 @@
-"""Every metric of a table, computed anew from the saved images, and what else must follow."""
+"""Every metric of a table, computed again from the saved images, and what else must follow."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from benchmarks.backbones import columns_of, judging_hashes
-from benchmarks.cells import OK, read_cell_files, scores_of
 from benchmarks.plan import TableFolder
 from benchmarks.protocol import Draw, Protocol
-from benchmarks.records import table_of
+from benchmarks.records import OK, Cell, Score, files_of
 from benchmarks.report.text import tables
 from benchmarks.results import Results, read_results
 from benchmarks.scenes import Scene
-from benchmarks.scoring import Score, score_files
-from benchmarks.verify_rows import cell_problems, plan_problems, require_recorded
+from benchmarks.scoring import score_files
+from benchmarks.verify_rows import cell_problems, plan_problems
 from extrap_train.config import ScoringConfig
 from extrap_train.errors import InputError
 
@@ -29,8 +27,10 @@ class Verification:
 
     cells: int = 0
     """How many were scored again."""
+    apart: int = 0
+    """How many of them say that no truth was in their method's reach."""
     problems: list[str] = field(default_factory=list)
-    """What does not agree, a line each."""
+    """What does not agree, one line each."""
     unchecked: dict[str, str] = field(default_factory=dict)
     """Columns that this machine cannot judge as the run did, and why."""
 
@@ -41,19 +41,19 @@ def verify(folder: TableFolder, lpips_weights: Mapping[str, str] | None = None) 
     Raises InputError where there is nothing that could be checked, or a file is damaged.
     """
     results = read_results(folder)
-    require_recorded(results)
     scoring, unchecked = _scoring_here(results, lpips_weights or {})
     found = Verification(unchecked=unchecked, problems=[*_report_problems(results)])
     made: list[tuple[str, Draw]] = []
     for cell in results.cells:
-        scene = Scene.open(folder.scenes / cell["scene"])
-        made.append((cell["method"], scene.draw))
+        scene = Scene.open(folder.scenes / cell.scene)
+        made.append((cell.method, scene.draw))
         problems = [*cell_problems(results, cell, scene)]
-        if cell["status"] == OK:
+        if cell.status == OK:
             found.cells += 1
+            found.apart += cell.truths_apart
             problems += _problems(results, cell, scene, scoring, unchecked)
-        found.problems += [f"{cell['key']} ({cell['method']}): {p}" for p in problems]
-    missing = set(results.plan["cells"]) - {cell["key"] for cell in results.cells}
+        found.problems += [f"{cell.key} ({cell.method}): {p}" for p in problems]
+    missing = set(results.plan.cells) - {cell.key for cell in results.cells}
     found.problems += [f"{key}: the cell is missing" for key in sorted(missing)]
     found.problems += _protocol_problems(results, made)
     return found
@@ -66,10 +66,10 @@ def _scoring_here(
 
     A column that had no weights in the run is not judged now, and must be empty.
     """
-    scoring = table_of(results.plan, results.folder.plan).scoring
+    scoring = results.plan.table.scoring
     there = {net: file for net, file in scoring.lpips_weights.items() if Path(file).is_file()}
     here = replace(scoring, lpips_weights={**there, **lpips_weights})
-    hashes, stated = judging_hashes(here), results.plan["networks"]
+    hashes, stated = judging_hashes(here), results.plan.networks
     unchecked = {}
     for column, sha256 in stated.items():
         if column not in hashes:
@@ -95,7 +95,7 @@ def _protocol_problems(results: Results, made: Sequence[tuple[str, Draw]]) -> It
 
 def _report_problems(results: Results) -> Iterator[str]:
     """CSV files that are not what the cells say."""
-    name = results.plan["table"]["name"]
+    name = results.plan.table.name
     for file, content in tables(results, name).items():
         path = results.folder.path / file
         if not path.is_file():
@@ -106,7 +106,7 @@ def _report_problems(results: Results) -> Iterator[str]:
 
 def _problems(
     results: Results,
-    cell: dict[str, Any],
+    cell: Cell,
     scene: Scene,
     scoring: ScoringConfig,
     unchecked: Mapping[str, str],
@@ -114,15 +114,15 @@ def _problems(
     """Photographs that have changed, and numbers that do not follow from the images."""
     changed = scene.changed_files()
     if changed:
-        yield f"{scene.folder / changed[0]} is not what its hash says"
+        yield f"{scene.file(changed[0])} is missing, or not what its hash says"
         return
-    if scene.data_hash != cell["hashes"]["data"]:
+    if scene.data_hash != cell.hashes.data:
         yield f"{scene.folder} holds other data than the cell was made from"
         return
-    folder = results.folder.cells / cell["key"]
-    pictures, points = (read_cell_files(folder, cell, kind) for kind in ("images", "points"))
-    again = score_files(pictures, points, scene.truth(), scoring)
-    stated = scores_of(cell)
+    folder = results.folder.cells / cell.key
+    pictures, points = (files_of(folder, kind) for kind in (cell.images, cell.points))
+    again = score_files(folder, pictures, points, scene, scoring)
+    stated = cell.metrics
     for name in dict.fromkeys([*stated, *again]):
         if name in unchecked:
             continue

@@ -5,26 +5,13 @@ options and frames that it is filed under.
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
-from typing import Any
 
 from benchmarks.method_checks import method_hash
 from benchmarks.plan import cell_key, images_hash, selected_draws
 from benchmarks.protocol import Draw, Protocol, digest
-from benchmarks.records import table_of
+from benchmarks.records import Cell
 from benchmarks.results import UNIT, Results
 from benchmarks.scenes import Scene
-from extrap_train.config import MethodConfig
-from extrap_train.errors import InputError
-
-
-def require_recorded(results: Results) -> None:
-    """InputError for a plan of before plans said what made their rows and judged them."""
-    made = all({"factory", "options"} <= method.keys() for method in results.methods.values())
-    if not made or "networks" not in results.plan:
-        raise InputError(
-            f"{results.folder.plan}: does not say what made its rows and what judged them; run the "
-            "table again, which uses its finished cells"
-        )
 
 
 def plan_problems(
@@ -34,18 +21,18 @@ def plan_problems(
     each cell's method and draw.
     """
     file = results.folder.plan
-    table = table_of(results.plan, file)
-    if protocol.sha256 != results.plan["protocol"]:
+    table = results.plan.table
+    if protocol.sha256 != results.plan.protocol:
         yield f"{results.folder.protocol}: is not the protocol that the results carry"
     if asdict(protocol.rules) != asdict(table.rules):
         yield f"{file}: its rules are not the protocol's"
     if list(results.methods) != table.methods:
         yield f"{file}: its rows are not the methods of its table"
     for name, given in table.options.items():
-        options = results.methods.get(name, {}).get("options", {})
-        if name in table.methods and options != {**options, **given}:
+        made_by = results.methods.get(name)
+        if made_by is not None and made_by.options != {**made_by.options, **given}:
             yield f"{file}: {name} was not made with the options that its table gives"
-    draws = selected_draws(table, protocol, results.plan["quick"])
+    draws = selected_draws(table, protocol, results.plan.quick)
     expected = {(name, draw) for name in table.methods for draw in draws}
     counts = Counter(made)
     for name, draw in sorted(expected - counts.keys(), key=_label):
@@ -61,21 +48,20 @@ def _label(row: tuple[str, Draw]) -> str:
     return f"{row[0]} on {row[1].label}"
 
 
-def cell_problems(results: Results, cell: dict[str, Any], scene: Scene) -> Iterator[str]:
+def cell_problems(results: Results, cell: Cell, scene: Scene) -> Iterator[str]:
     """What a cell says of itself and its hashes, its draw or its row do not."""
-    hashes, row = cell["hashes"], results.methods[cell["method"]]
-    if images_hash(hashes) != hashes["images"] or cell_key(hashes) != cell["key"]:
+    hashes, row = cell.hashes, results.methods[cell.method]
+    if images_hash(hashes) != hashes.images or cell_key(hashes) != cell.key:
         yield "its name does not follow from the hashes that it states"
-    if hashes["method"] != method_hash(
-        MethodConfig(factory=row["factory"], options=row["options"])
-    ):
-        yield f"was not made by {row['factory']} with the options of its row"
-    if cell["options"] != row["options"]:
-        yield f"states the options {cell['options']}, its row has {row['options']}"
-    if hashes["device"] != cell["device"]:
-        yield f"states the device {cell['device']}, made on {hashes['device']}"
-    if hashes["rules"] != digest(results.plan["table"]["rules"]):
+    if hashes.method != method_hash(row):
+        yield f"was not made by {row.factory} with the options of its row"
+    if cell.options != row.options:
+        yield f"states the options {cell.options}, its row has {row.options}"
+    if hashes.device != cell.device:
+        yield f"states the device {cell.device}, made on {hashes.device}"
+    if hashes.rules != digest(asdict(results.plan.table.rules)):
         yield "was made by other rules"
     for name in (*UNIT, "n_views"):
-        if cell[name] != getattr(scene.draw, name):
-            yield f"states {name} {cell[name]}, its photographs are of {getattr(scene.draw, name)}"
+        stated, drawn = getattr(cell, name), getattr(scene.draw, name)
+        if stated != drawn:
+            yield f"states {name} {stated}, its photographs are of {drawn}"

@@ -4,28 +4,31 @@ from pathlib import Path
 
 from benchmarks.catalogue import Catalogue
 from benchmarks.plan import TableFolder
-from benchmarks.report.layout import lay_out
+from benchmarks.report.layout import Layout, lay_out
 from benchmarks.report.page import page
 from benchmarks.report.plots import plots
-from benchmarks.report.text import latex, markdown, tables
+from benchmarks.report.text import latex, markdown, numbers, tables
 from benchmarks.results import Results
 from extrap_train.store.atomic import write_atomic
+
+__all__ = ["laid_out", "numbers", "write_reports"]
 
 FORMATS = ("csv", "md", "latex", "html")
 
 
+def laid_out(results: Results, catalogue: Catalogue) -> Layout:
+    """A table's results, arranged, with the published numbers that it names."""
+    reported = results.plan.table.reported
+    return lay_out(results, catalogue.reported(reported) if reported else None)
+
+
 def write_reports(
-    results: Results,
-    catalogue: Catalogue,
-    folder: TableFolder,
-    formats: tuple[str, ...] = FORMATS,
+    results: Results, layout: Layout, folder: TableFolder, formats: tuple[str, ...] = FORMATS
 ) -> list[Path]:
     """Write the reports of some formats beside the cells; returns the files, the first to read
     last.
     """
-    name = results.plan["table"]["name"]
-    reported = results.plan["table"]["reported"]
-    layout = lay_out(results, catalogue.reported(reported) if reported else None)
+    name = results.plan.table.name
     contents: dict[str, bytes] = {}
     if "csv" in formats:
         contents |= tables(results, name)

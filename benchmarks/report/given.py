@@ -3,7 +3,7 @@
 import re
 from collections import Counter
 
-from benchmarks.cells import OK
+from benchmarks.records import OK
 from benchmarks.results import Results
 
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
@@ -13,9 +13,9 @@ def given_notes(results: Results) -> list[str]:
     """One line of what the finished cells say that they were given, or none."""
     used: dict[str, dict[str, Counter[str]]] = {}
     for cell in results.cells:
-        if cell["status"] == OK:
-            for name, value in cell["given"].items():
-                used.setdefault(cell["method"], {}).setdefault(name, Counter())[value] += 1
+        if cell.status == OK:
+            for name, value in cell.given.items():
+                used.setdefault(cell.method, {}).setdefault(name, Counter())[value] += 1
     lines = [
         f"{method} — {', '.join(f'{name}: {_counted(values)}' for name, values in words.items())}"
         for method, words in used.items()

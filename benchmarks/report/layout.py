@@ -5,11 +5,12 @@ from typing import Any
 
 import pandas as pd
 
-from benchmarks.cells import OK
 from benchmarks.chance import FEWEST_CAPTURES
 from benchmarks.columns import direction
+from benchmarks.records import OK
 from benchmarks.report.given import given_notes
 from benchmarks.results import Results
+from benchmarks.words import one_line
 
 NAMES = {
     "lpips_alex": "LPIPS (alex)",
@@ -35,6 +36,7 @@ NAMES = {
 }
 _ARROWS = {1: "↑", -1: "↓", 0: ""}
 _DIGITS = {"psnr": 2, "memory_mib": 0}
+_MAX_NOTE = 4000
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ class Panel:
     rows: list[Row]
 
     def headings(self) -> list[str]:
-        """Metric with its arrow and the number of views, a column each."""
+        """Metric with its arrow and the number of views, per column."""
         return [f"{name_of(m)} {_ARROWS[direction(m)]} {n} views" for m, n in self.columns]
 
 
@@ -88,26 +90,29 @@ class Layout:
 
 def name_of(metric: str) -> str:
     """A metric as a heading."""
-    return NAMES.get(metric, metric.replace("_", " "))
+    return NAMES.get(metric, one_line(metric.replace("_", " ")))
 
 
 def lay_out(results: Results, reported: dict[str, Any] | None) -> Layout:
-    """Arrange a table's results; `reported` is a file of published numbers."""
-    table = results.plan["table"]
+    """Arrange a table's results; `reported` is a file of published numbers.
+
+    Every text is on one line; each format escapes what means something in it.
+    """
+    name = one_line(results.plan.table.title or results.plan.table.name)
     panels = []
-    categories = list(dict.fromkeys(cell["category"] for cell in results.cells))
+    categories = list(dict.fromkeys(cell.category for cell in results.cells))
     for category in [None, *(categories if len(categories) > 1 else [])]:
         means = results.means(category)
-        for draw in dict.fromkeys(cell["draw"] for cell in results.cells):
-            title = f"{category or table['title'] or table['name']}, {draw} inputs"
+        for draw in dict.fromkeys(cell.draw for cell in results.cells):
+            title = one_line(f"{category or name}, {draw} inputs")
             panels.append(_panel(title, results, means[means["draw"] == draw], category, draw))
-    quick = " (quick: a part of the table)" if results.plan["quick"] else ""
+    quick = " (quick: a part of the table)" if results.plan.quick else ""
     return Layout(
-        title=(table["title"] or table["name"]) + quick,
+        title=name + quick,
         panels=panels,
         reported=None if reported is None else _reported(reported),
-        missing=_missing(results),
-        notes=_notes(results),
+        missing=[one_line(line, _MAX_NOTE) for line in _missing(results)],
+        notes=[one_line(line, _MAX_NOTE) for line in _notes(results)],
     )
 
 
@@ -115,18 +120,16 @@ def _panel(
     title: str, results: Results, means: pd.DataFrame, category: str | None, draw: str
 ) -> Panel:
     cells = [
-        cell
-        for cell in results.cells
-        if cell["draw"] == draw and category in (None, cell["category"])
+        cell for cell in results.cells if cell.draw == draw and category in (None, cell.category)
     ]
-    views = sorted({cell["n_views"] for cell in cells})
-    captures = len({(cell["category"], cell["sequence"]) for cell in cells})
-    columns = [(metric, n) for metric in results.plan["table"]["columns"] for n in views]
+    views = sorted({cell.n_views for cell in cells})
+    captures = len({(cell.category, cell.sequence) for cell in cells})
+    columns = [(metric, n) for metric in results.plan.table.columns for n in views]
     known = {(r.method, r.metric, r.n_views): r for r in means.itertuples()}
     rows = [
         Row(
-            entry["title"] or method,
-            entry["group"],
+            one_line(entry.title or method),
+            one_line(entry.group),
             [_entry(known.get((method, *column)), column[0]) for column in columns],
         )
         for method, entry in results.methods.items()
@@ -188,17 +191,16 @@ def _stated(value: float | None, metric: str) -> Entry:
 
 
 def _missing(results: Results) -> list[str]:
-    """One line a reason."""
+    """One line per reason."""
     reasons: dict[str, list[str]] = {}
     for cell in results.cells:
-        if cell["status"] != OK:
-            where = f"{cell['method']} ({cell['status']})"
-            reasons.setdefault(cell["reason"], []).append(where)
+        if cell.status != OK:
+            reasons.setdefault(cell.reason, []).append(f"{cell.method} ({cell.status})")
             continue
-        for metric, score in cell["metrics"].items():
-            if score["value"] is None:
-                reasons.setdefault(score["reason"], []).append(name_of(metric))
-    absent = len(results.plan["cells"]) - len(results.cells)
+        for metric, score in cell.metrics.items():
+            if score.value is None:
+                reasons.setdefault(score.reason, []).append(name_of(metric))
+    absent = len(results.plan.cells) - len(results.cells)
     lines = [
         f"{', '.join(sorted(set(where)))}: {len(where)} × {reason}"
         for reason, where in reasons.items()
@@ -207,13 +209,12 @@ def _missing(results: Results) -> list[str]:
 
 
 def _notes(results: Results) -> list[str]:
-    times = {entry["title"]: entry["time"] for entry in results.methods.values()}
-    protocol = results.plan["protocol"]
-    rules = results.plan["table"]["rules"]
-    devices = sorted({cell["device"] for cell in results.cells})
+    times = {entry.title: entry.time for entry in results.methods.values()}
+    protocol, rules = results.plan.protocol, results.plan.table.rules
+    devices = sorted({cell.device for cell in results.cells})
     return [
-        f"Protocol {protocol[:16]}: {rules['pool']} frames by farthest-point sampling, "
-        f"{rules['image_size']} × {rules['image_size']} px, depth of the inputs: {rules['depth']}. "
+        f"Protocol {protocol[:16]}: {rules.pool} frames by farthest-point sampling, "
+        f"{rules.image_size} × {rules.image_size} px, depth of the inputs: {rules.depth}. "
         f"Device: {', '.join(devices)}.",
         "Best bold, second underlined; ° marks what cannot be told from the best (sign-flip test "
         "of the paired differences over captures, p above 5 %; below "

@@ -3,20 +3,23 @@
 import base64
 import io
 import json
+import math
 from importlib.resources import files
 from typing import Any
 
-import torch
 from jaxtyping import Float
 from jinja2 import Environment
 from PIL import Image
 from torch import Tensor
 
-from benchmarks.cells import OK, read_cell_images
+from benchmarks.files import pictures_of
+from benchmarks.records import OK, Cell, read_limited
 from benchmarks.report.layout import Layout, name_of
 from benchmarks.results import Results
 from benchmarks.scenes import Scene
+from benchmarks.words import one_line
 from extrap_train.data.images import to_eight_bits
+from extrap_train.errors import InputError
 from extrap_train.pictures import error_map
 
 _LARGE_PIXELS = 160
@@ -29,8 +32,8 @@ def page(results: Results, layout: Layout, plots: dict[str, str]) -> str:
     template = environment.from_string(
         (files("benchmarks.report") / "page.html").read_text("utf-8")
     )
-    # "</" would end the script that the data stands in.
-    data = json.dumps(_scenes(results)).replace("</", "<\\/")
+    # No "</script" or "<!--" may stand in the element that holds the data.
+    data = json.dumps(_scenes(results)).replace("<", "\\u003c")
     return template.render(
         layout=layout,
         plots=plots,
@@ -42,33 +45,37 @@ def page(results: Results, layout: Layout, plots: dict[str, str]) -> str:
 
 def _scenes(results: Results) -> list[dict[str, Any]]:
     """Every prepared draw with its inputs, truths, and each method's images, errors and scores."""
-    by_scene: dict[str, list[dict[str, Any]]] = {}
+    by_scene: dict[str, list[Cell]] = {}
     for cell in results.cells:
-        by_scene.setdefault(cell["scene"], []).append(cell)
+        by_scene.setdefault(cell.scene, []).append(cell)
     return [_scene(results, name, cells) for name, cells in by_scene.items()]
 
 
-def _scene(results: Results, name: str, cells: list[dict[str, Any]]) -> dict[str, Any]:
+def _scene(results: Results, name: str, cells: list[Cell]) -> dict[str, Any]:
     scene = Scene.open(results.folder.scenes / name)
     truth = scene.truth()
     return {
         "name": name,
         "inputs": [_embedded(view.image) for view in scene.inputs().views],
         "targets": list(scene.draw.targets),
-        "angles": [round(float(torch.rad2deg(torch.tensor(a)))) for a in scene.angles_rad],
+        "angles": [round(math.degrees(angle)) for angle in scene.record.angles_rad],
         "truth": [_embedded(image) for image in truth.images],
         "warp": [_embedded(image) for image in truth.warps],
-        "methods": [_method(results, cell, truth.images) for cell in cells],
+        "methods": [_method(results, cell, scene, truth.images) for cell in cells],
     }
 
 
 def _method(
-    results: Results, cell: dict[str, Any], truth: Float[Tensor, "n 3 h w"]
+    results: Results, cell: Cell, scene: Scene, truth: Float[Tensor, "n 3 h w"]
 ) -> dict[str, Any]:
-    title = results.methods[cell["method"]]["title"] or cell["method"]
-    if cell["status"] != OK:
-        return {"title": title, "status": cell["status"], "reason": cell["reason"]}
-    images = read_cell_images(results.folder.cells / cell["key"], cell)
+    title = one_line(results.methods[cell.method].title or cell.method)
+    if cell.status != OK:
+        return {"title": title, "status": cell.status, "reason": one_line(cell.reason)}
+    files = [results.folder.cells / cell.key / name for name in cell.images]
+    if len(files) != len(truth):
+        raise InputError(f"{files[0].parent}: has another number of images than of targets")
+    side = scene.record.image_size
+    images = pictures_of({file: read_limited(file) for file in files}, side)
     shown = ("masked_psnr", "lpips_squeeze", "lpips_alex")
     return {
         "title": title,
@@ -76,9 +83,9 @@ def _method(
         "images": [_embedded(image) for image in images],
         "errors": [_embedded(image) for image in error_map(images, truth)],
         "scores": {
-            name_of(m): cell["metrics"][m]["per_image"]
+            name_of(m): cell.metrics[m].per_image
             for m in shown
-            if cell["metrics"].get(m, {}).get("per_image")
+            if m in cell.metrics and cell.metrics[m].per_image
         },
     }
 

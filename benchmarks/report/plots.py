@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.report.layout import name_of
 from benchmarks.results import CAPTURE, Results
+from benchmarks.words import one_line
 
 _BIN_DEG = 20
 _ASIDE_DEG = 0.7
@@ -20,6 +21,11 @@ ANGLE_METRICS = ("masked_psnr", "psnr", "lpips_squeeze", "lpips_alex")
 
 def plots(results: Results) -> dict[str, str]:
     """SVG texts by name; a metric that no cell has is left out."""
+    with plt.rc_context({"text.parse_math": False, "svg.hashsalt": "table"}):  # the same bytes
+        return _plots(results)
+
+
+def _plots(results: Results) -> dict[str, str]:
     images = results.by_image.dropna(subset=["value"])
     drawn = {}
     for metric in ANGLE_METRICS:
@@ -33,7 +39,7 @@ def plots(results: Results) -> dict[str, str]:
 
 
 def _over_angle(part: pd.DataFrame, metric: str, results: Results) -> str:
-    """A panel a draw and number of views, which angles go with: more inputs are nearer to all
+    """One panel per draw and number of views, which angles go with: more inputs are nearer to all
     targets, and so are well-spread ones.
     """
     draws, views = list(dict.fromkeys(part["draw"])), sorted(set(part["n_views"]))
@@ -51,9 +57,9 @@ def _over_angle(part: pd.DataFrame, metric: str, results: Results) -> str:
         for index, (method, entry) in enumerate(results.methods.items()):
             own = binned(chosen[chosen["method"] == method])
             aside = (index - (len(results.methods) - 1) / 2) * _ASIDE_DEG
-            _curve(axes, own, aside, f"C{index}", entry["title"] or method)
+            _curve(axes, own, aside, f"C{index}", one_line(entry.title or method))
         _captures_below(axes, chosen)
-        axes.set_title(f"{draw} inputs, {n_views} views", fontsize="medium")
+        axes.set_title(f"{one_line(draw)} inputs, {n_views} views", fontsize="medium")
     for axes in grid[-1]:
         axes.set_xlabel("angle to the nearest input, degrees")
     for axes in grid[:, 0]:
@@ -63,7 +69,7 @@ def _over_angle(part: pd.DataFrame, metric: str, results: Results) -> str:
 
 
 def binned(images: pd.DataFrame) -> pd.DataFrame:
-    """A row an interval of angles, by its `center`: mean over captures, its standard error (NaN
+    """One row per interval of angles, by its `center`: mean over captures, its standard error (NaN
     for a single one) and the count of `captures`. Images of one capture are no further samples.
     """
     center = ((images["angle_deg"] // _BIN_DEG + 0.5) * _BIN_DEG).rename("center")
@@ -99,13 +105,13 @@ def _captures_below(axes: Axes, images: pd.DataFrame) -> None:
 
 
 def _over_time(means: pd.DataFrame, metric: str, results: Results) -> str:
-    """A point a method and number of views."""
+    """One point per method and number of views."""
     wide = means.pivot_table(index=["method", "draw", "n_views"], columns="metric", values="mean")
     figure, axes = plt.subplots(figsize=(6.2, 3.6), layout="constrained")
     for index, (method, entry) in enumerate(results.methods.items()):
         own = wide[wide.index.get_level_values("method") == method]
         if len(own):
-            label = entry["title"] or method
+            label = one_line(entry.title or method)
             axes.plot(own["seconds"], own[metric], "o", color=f"C{index}", label=label)
     axes.set_xscale("log")
     axes.set_xlabel("perform time, seconds (in all, or per image: see the notes)")
@@ -125,8 +131,7 @@ def _legend(figure: Figure) -> None:
 
 def _svg(figure: Figure) -> str:
     content = io.StringIO()
-    with plt.rc_context({"svg.hashsalt": "table"}):  # the same bytes every time
-        figure.savefig(content, format="svg", metadata={"Date": None})
+    figure.savefig(content, format="svg", metadata={"Date": None})
     plt.close(figure)
     text = content.getvalue()
     return text[text.index("<svg") :]

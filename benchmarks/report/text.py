@@ -2,9 +2,13 @@
 
 from collections.abc import Callable
 
+import pandas as pd
+
 from benchmarks.report.layout import Entry, Layout, Panel
 from benchmarks.results import Results
+from benchmarks.words import one_line
 
+_MARKDOWN_SPECIAL = {"<": "&lt;", ">": "&gt;"} | {letter: f"\\{letter}" for letter in "\\`*|[]"}
 _LATEX_SPECIAL = {
     "\\": r"\textbackslash{}",
     "&": r"\&",
@@ -28,25 +32,87 @@ _LATEX_SPECIAL = {
 def tables(results: Results, name: str) -> dict[str, bytes]:
     """The CSV files by name: every number, the means, and the numbers by image."""
     frames = {"": results.tidy, "_mean": results.means(), "_images": results.by_image}
-    return {f"{name}{kind}.csv": f.to_csv(index=False).encode() for kind, f in frames.items()}
+    return {
+        f"{name}{kind}.csv": _without_formulas(frame).to_csv(index=False).encode()
+        for kind, frame in frames.items()
+    }
+
+
+def _without_formulas(frame: pd.DataFrame) -> pd.DataFrame:
+    """No text is one that a spreadsheet would compute, or on several lines."""
+    texts = [name for name in frame if not pd.api.types.is_numeric_dtype(frame[name])]
+    return frame.assign(**{str(name): frame[name].map(_spreadsheet_text) for name in texts})
+
+
+def _spreadsheet_text(value: object) -> object:
+    if not isinstance(value, str):
+        return value
+    line = one_line(value)
+    return f"'{line}" if line.startswith(("=", "+", "-", "@")) else line
+
+
+def numbers(layout: Layout, width: int) -> str:
+    """The panel over everything in plain columns, in as many blocks as the width needs."""
+    panel = layout.panels[0]
+    labels = ["", "", *(row.label for row in panel.rows)]
+    columns = [
+        [*_two_lines(heading), *(_plain_entry(row.entries[i]) for row in panel.rows)]
+        for i, heading in enumerate(panel.headings())
+    ]
+    blocks: list[list[list[str]]] = []
+    room = 0
+    for column in columns:
+        wide = max(map(len, column)) + 2
+        if wide > room:
+            blocks.append([labels])
+            room = width - max(map(len, labels))
+        blocks[-1].append(column)
+        room -= wide
+    return "\n\n".join([f"{panel.title} (* best)", *map(_block, blocks)])
+
+
+def _two_lines(heading: str) -> tuple[str, str]:
+    metric, count, views = heading.rsplit(" ", 2)
+    return metric, f"{count} {views}"
+
+
+def _plain_entry(entry: Entry) -> str:
+    return f"{'*' if entry.rank == 1 else ''}{entry.text}"
+
+
+def _block(columns: list[list[str]]) -> str:
+    wide = [max(map(len, column)) for column in columns]
+    lines = zip(*columns, strict=True)
+    return "\n".join(
+        "  ".join(
+            text.rjust(wide[i]) if i else text.ljust(wide[i]) for i, text in enumerate(line)
+        ).rstrip()
+        for line in lines
+    )
 
 
 def markdown(layout: Layout) -> str:
     """Every panel as a pipe table."""
-    parts = [f"# {layout.title}\n"]
+    parts = [f"# {_markdown(layout.title)}\n"]
     panels = [*layout.panels[:1], *([layout.reported] if layout.reported else [])]
     panels += layout.panels[1:]
-    parts += [f"## {panel.title}\n\n{_pipe_table(panel)}\n" for panel in panels]
-    parts.append("\n\n".join(layout.notes) + "\n")
+    parts += [f"## {_markdown(panel.title)}\n\n{_pipe_table(panel)}\n" for panel in panels]
+    parts.append("\n\n".join(map(_markdown, layout.notes)) + "\n")
     if layout.missing:
-        parts.append("Missing:\n\n" + "\n".join(f"- {line}" for line in layout.missing) + "\n")
+        lines = [f"- {_markdown(line)}" for line in layout.missing]
+        parts.append("Missing:\n\n" + "\n".join(lines) + "\n")
     return "\n".join(parts)
 
 
 def _pipe_table(panel: Panel) -> str:
-    lines = [["method", *panel.headings()], ["---"] * (len(panel.columns) + 1)]
-    lines += [[row.label, *map(_markdown_entry, row.entries)] for row in panel.rows]
+    headings = map(_markdown, panel.headings())
+    lines = [["method", *headings], ["---"] * (len(panel.columns) + 1)]
+    lines += [[_markdown(row.label), *map(_markdown_entry, row.entries)] for row in panel.rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _markdown(text: str) -> str:
+    return "".join(_MARKDOWN_SPECIAL.get(letter, letter) for letter in text)
 
 
 def _markdown_entry(entry: Entry) -> str:
@@ -59,7 +125,7 @@ def _marked(entry: Entry, best: Callable[[str], str], second: Callable[[str], st
 
 
 def latex(layout: Layout) -> str:
-    """Every panel as a `table*` for booktabs and ulem or soul's `\\underline`."""
+    """Every panel as a `table*` for booktabs."""
     panels = [*layout.panels[:1], *([layout.reported] if layout.reported else [])]
     tables = [_latex_table(panel) for panel in [*panels, *layout.panels[1:]]]
     notes = "\n".join(f"% {line}" for line in [*layout.notes, *layout.missing])

@@ -111,6 +111,9 @@ class TableConfig:
     )
     output: str = option("results", "folder of all results")
     device: str = option("auto", "device of the methods: cpu, cuda, or auto: CUDA if there is one")
+    cell_timeout_s: float = option(
+        6 * 3600.0, "most time that a method may take for one cell", unit="s", low=1, high=1e7
+    )
     slurm: SlurmConfig = field(default_factory=SlurmConfig)
 
 

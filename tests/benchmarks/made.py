@@ -3,10 +3,11 @@
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 from benchmarks.plan import TableFolder
+from benchmarks.records import Cell, Hashes, Plan, Score
 from benchmarks.results import Results
+from extrap_train.config import MethodConfig, TableConfig
 
 
 def cell(
@@ -17,30 +18,36 @@ def cell(
     others: Mapping[str, float | None] = MappingProxyType({}),
     scoring: str = "judges",
     **given: str,
-) -> dict[str, Any]:
+) -> Cell:
     """One with three views of a cup; it has failed where `psnr` is None."""
-    head = {"method": method, "category": "cup", "sequence": sequence, "draw": "random"}
-    head |= {"seed": seed, "n_views": 3, "device": "cpu", "scene": f"cup-{sequence}-3-random-0"}
-    head |= {"hashes": {"data": f"photographs of {sequence}", "scoring": scoring}}
-    if psnr is None:
-        return head | {"status": "failed", "reason": "no luck"}
-    scores = {
-        name: {"value": value, "reason": "", "per_image": [value]}
-        for name, value in {"psnr": psnr, **others}.items()
-    }
-    measured = {"seconds": 1.0, "peak_memory_mib": 9.0, "given": given}
-    return head | {"status": "ok", "reason": "", "metrics": scores} | measured
+    hashes = dict.fromkeys(Hashes.__dataclass_fields__, "")
+    hashes |= {"data": f"photographs of {sequence}", "scoring": scoring}
+    state = {"status": "failed", "reason": "no luck"} if psnr is None else {"status": "ok"}
+    scores = {} if psnr is None else {"psnr": psnr, **others}
+    return Cell(
+        key="key",
+        method=method,
+        options={},
+        category="cup",
+        sequence=sequence,
+        n_views=3,
+        draw="random",
+        seed=seed,
+        scene=f"cup-{sequence}-3-random-0",
+        device="cpu",
+        hashes=Hashes(**hashes),
+        seconds=1.0,
+        peak_memory_mib=9.0,
+        given=given,
+        metrics={name: Score(value, "", [value]) for name, value in scores.items()},
+        **state,  # type: ignore[arg-type]
+    )
 
 
-def results(*cells: dict[str, Any]) -> Results:
+def results(*cells: Cell) -> Results:
     """A table of these cells, with their methods in the order of their first ones."""
-    names = dict.fromkeys(cell["method"] for cell in cells)
-    table = {"name": "t", "title": "", "columns": ["psnr"]}
-    plan = {
-        "table": {**table, "rules": {"pool": 9, "image_size": 64, "depth": "dataset"}},
-        "protocol": "0" * 64,
-        "quick": False,
-        "cells": ["key"] * len(cells),
-        "methods": {name: {"title": name, "group": "", "time": "in all"} for name in names},
-    }
+    names = dict.fromkeys(cell.method for cell in cells)
+    methods = {name: MethodConfig(name=name, title=name, factory="a.B") for name in names}
+    table = TableConfig(name="t", columns=["psnr"])
+    plan = Plan(table, False, "0" * 64, {}, methods, ["key"] * len(cells))
     return Results(TableFolder(Path("nowhere")), plan, list(cells))

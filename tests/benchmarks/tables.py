@@ -6,7 +6,6 @@ from benchmarks.catalogue import Catalogue
 from benchmarks.plan import TableFolder
 from benchmarks.runner import RunOptions, run_table
 from extrap_train.jobs import Launcher
-from extrap_train.jobs.local import LocalLauncher
 
 _METHOD = '''
 import os
@@ -86,10 +85,10 @@ def write_own(folder: Path) -> Path:
 def run_greys(
     own: Path, output: Path, *overrides: str, launcher: Launcher | None = None, **options: object
 ) -> int:
-    """Run the table, in this process unless there is a launcher."""
+    """Run the table, one cell after another unless there is a launcher."""
     catalogue = Catalogue.with_own([str(own)])
     table = catalogue.table("greys", [f"output={output}", *overrides])
-    run = RunOptions(launcher=launcher or LocalLauncher(1), **options)  # type: ignore[arg-type]
+    run = RunOptions(**{"workers": 1, "launcher": launcher, **options})  # type: ignore[arg-type]
     return run_table(table, catalogue, run)
 
 

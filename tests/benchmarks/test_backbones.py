@@ -56,7 +56,7 @@ def put_backbone(hub: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[int], 
 def _scored(own: Path, output: Path) -> dict[str, tuple[float | None, float]]:
     assert run_greys(own, output, "scoring.lpips=[squeeze]", quick=True) == 0
     cells = read_results(greys_folder(output)).cells
-    return {c["method"]: (c["metrics"]["lpips_squeeze"]["value"], c["seconds"]) for c in cells}
+    return {c.method: (c.metrics["lpips_squeeze"].value, c.seconds) for c in cells}
 
 
 def test_a_backbone_put_into_the_hub_cache_is_used_by_the_next_run(
@@ -119,11 +119,11 @@ def test_verification_judges_with_the_very_weights_or_says_that_it_did_not(
     words = ["scoring.lpips=[squeeze]", f"scoring.lpips_weights.squeeze={weights}"]
     assert run_greys(own, tmp_path, *words, quick=True) == 0
     folder = greys_folder(tmp_path)
-    assert verify(folder) == Verification(cells=2)
+    assert verify(folder) == Verification(cells=2, apart=2)
     moved = weights.rename(tmp_path / "elsewhere.pt")
     here = {"lpips_squeeze": "its weights are not here; give scoring.lpips_weights.squeeze=FILE"}
-    assert verify(folder) == Verification(cells=2, unchecked=here)
-    assert verify(folder, {"squeeze": str(moved)}) == Verification(cells=2)
+    assert verify(folder) == Verification(cells=2, apart=2, unchecked=here)
+    assert verify(folder, {"squeeze": str(moved)}) == Verification(cells=2, apart=2)
     put_backbone(0)
     assert "not those" in verify(folder).unchecked["lpips_squeeze"]
     capsys.readouterr()

@@ -1,5 +1,6 @@
 """What is said of a change: only what enough captures bear out, and who judged."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -37,7 +38,7 @@ def test_five_captures_are_too_few_however_alike() -> None:
 
 def test_memory_has_no_verdict() -> None:
     before = results(*(cell("a", str(i), 0, 20.0) for i in range(8)))
-    after = results(*(cell("a", str(i), 0, 20.0) | {"peak_memory_mib": 5.0} for i in range(8)))
+    after = results(*(replace(cell("a", str(i), 0, 20.0), peak_memory_mib=5.0) for i in range(8)))
     assert set(compare_results(before, after).query("metric == 'peak_memory_mib'")["verdict"]) == {
         ""
     }

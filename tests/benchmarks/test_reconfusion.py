@@ -121,8 +121,8 @@ def test_the_table_runs_with_published_numbers_beside_it(root: Path, tmp_path: P
     table = catalogue.table("reconfusion", [f"captures.root={root}", f"output={tmp_path}", *words])
     assert run_table(table, catalogue, RunOptions(launcher=LocalLauncher(1))) == 0
     cells = read_results(TableFolder(tmp_path / "reconfusion")).cells
-    assert {cell["status"] for cell in cells} == {"ok"}
-    assert all(cell["metrics"]["psnr"]["value"] > 8 for cell in cells)
+    assert {cell.status for cell in cells} == {"ok"}
+    assert all(cell.metrics["psnr"].value > 8 for cell in cells)
     text = (tmp_path / "reconfusion" / "reconfusion.md").read_text()
     assert "Reported, not measured here" in text
     assert "ReconFusion (second-hand)" in text

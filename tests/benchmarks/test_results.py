@@ -48,7 +48,7 @@ def test_seeds_of_one_capture_are_no_further_captures() -> None:
     assert tuple(means.loc["a", ["low", "high"]]) == pytest.approx((25 - half, 25 + half), rel=1e-4)
     assert list(means["cells"]) == [60, 60]
     assert list(means["captures"]) == [2, 2]
-    one = results(*(one for one in cells if one["sequence"] == "0")).means()
+    one = results(*(one for one in cells if one.sequence == "0")).means()
     assert not one["behind_best"].any(), "a single capture tells nothing, with any number of seeds"
     assert one[["low", "high"]].isna().all(axis=None)
 

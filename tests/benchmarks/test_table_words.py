@@ -54,8 +54,9 @@ def test_read_only_output_is_one_line(own: Path, tmp_path: Path) -> None:
         (["run", "table1", "rules.draws=[given]", "draws=[given]"], "rules.draws=['given']: capt"),
         (["run", "reconfusion", "rules.draws=[random]", "draws=[random]"], "has draws of its own"),
         (["run", "table1", "reported=nonsense"], "reported: 'nonsense' is unknown; known:"),
-        (["run", "table1", "rules.image_size=0"], "rules.image_size=0: must be at least 11"),
-        (["run", "table1", "rules.fine_scale=0"], "rules.fine_scale=0: must be at least 1"),
+        (["run", "table1", "rules.image_size=0"], "rules.image_size=0: must be from 11"),
+        (["run", "table1", "rules.fine_scale=0"], "rules.fine_scale=0: must be from 1"),
+        (["run", "table1", "cell_timeout_s=nan"], "cell_timeout_s=nan: must be from 1"),
         (["report", "table1", "columns=[psnr]"], "columns=[psnr]: a report takes output=FOLDER"),
         (
             ["run", "real", "captures.source=scenes", "captures.scenes=[synthetic:cup/0010]"],
@@ -106,7 +107,7 @@ def test_the_readmes_method_runs_as_it_stands(tmp_path: Path) -> None:
     (own / "blur.py").write_text(source)
     (own / "method" / "average.yaml").write_text(yaml)
     assert run_greys(own, tmp_path / "out", "methods=[average]", quick=True) == 0
-    assert read_results(greys_folder(tmp_path / "out")).cells[0]["status"] == "ok"
+    assert read_results(greys_folder(tmp_path / "out")).cells[0].status == "ok"
 
 
 def test_slurm_takes_the_clusters_options_and_says_where_there_is_none(

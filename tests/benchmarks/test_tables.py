@@ -8,11 +8,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks import cells, making
+from benchmarks import making
 from benchmarks.__main__ import main
 from benchmarks.catalogue import Catalogue
 from benchmarks.compare import compare
+from benchmarks.door import let_in
+from benchmarks.plan import cell_jobs, open_protocol
 from benchmarks.results import TIDY, read_results
+from benchmarks.scenes import Scene
 from extrap_train.errors import InputError
 from extrap_train.jobs.slurm import SubmittedLauncher
 from tests.benchmarks.tables import greys_folder, run_greys
@@ -51,11 +54,12 @@ def test_every_report_is_there(finished: Path) -> None:
 def test_a_cell_says_what_made_it(finished: Path) -> None:
     cells = read_results(greys_folder(finished)).cells
     for cell in cells:
-        assert {"protocol", "data", "method", "code", "weights", "scoring"} <= set(cell["hashes"])
-        assert cell["given"] == {"init": "none"}
-        assert cell["counts"] == {"greys": 1.0}
-        assert cell["versions"]["torch"]
-    assert len({cell["key"] for cell in cells}) == len(cells) == 4
+        assert all(vars(cell.hashes).values())
+        assert cell.given == {"init": "none"}
+        assert cell.counts == {"greys": 1.0}
+        assert cell.versions["torch"]
+        assert cell.truths_apart
+    assert len({cell.key for cell in cells}) == len(cells) == 4
 
 
 def test_a_second_run_uses_every_cell_again(
@@ -121,7 +125,7 @@ def test_a_corrupt_cell_is_announced_and_made_anew(
     victim.write_bytes(bare if damage == b"bare" else damage)
     assert run_greys(own, copy) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert "made anew" in said
+    assert "made again" in said
     assert "3 finished and used again, 1 open" in said
     pd.testing.assert_frame_equal(_table(copy), _table(finished))
 
@@ -140,11 +144,12 @@ def test_a_cell_of_the_cpu_sees_no_gpu_from_its_start(
 
     monkeypatch.setattr(making, "PeakMemory", Watched)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
-    table = Catalogue.with_own([str(own)]).table("greys", [f"output={copy}", "device=cpu"])
-    dark = Catalogue.with_own([str(own)]).method("dark")
-    scene = next(copy.glob("greys/scenes/*"))
-    job = cells.CellJob(copy / "greys/cells/new", scene, dark, table.scoring, "cpu", {})
-    assert cells.run_cell(job)["status"] == "ok"
+    folder, catalogue = greys_folder(copy), Catalogue.with_own([str(own)])
+    table = catalogue.table("greys", [f"output={copy}", "device=cpu"])
+    protocol, _ = open_protocol(table, folder)
+    scenes = [Scene.open(path) for path in folder.scenes.glob("*-*")]
+    job = cell_jobs(table, folder, protocol, [catalogue.method("dark")], scenes)[0]
+    assert let_in(making.make(job), 6, 24, "dark").handed.status == "made"
     assert seen == [""]
 
 
@@ -152,12 +157,12 @@ def test_a_protocol_without_results_gives_way(own: Path, tmp_path: Path) -> None
     """A first command that was wrong does not spoil the folder for the right one."""
     assert run_greys(own, tmp_path, "rules.image_size=16", dry_run=True) == 0
     assert run_greys(own, tmp_path, quick=True) == 0
-    assert read_results(greys_folder(tmp_path)).plan["table"]["rules"]["image_size"] == 24
+    assert read_results(greys_folder(tmp_path)).plan.table.rules.image_size == 24
 
 
 def test_a_plan_that_is_none_is_one_line(copy: Path) -> None:
     greys_folder(copy).plan.write_text("{}")
-    with pytest.raises(InputError, match=r"plan.json: is no table's plan"):
+    with pytest.raises(InputError, match=r"plan.json: is no Plan record"):
         read_results(greys_folder(copy))
 
 
@@ -174,20 +179,21 @@ def test_results_of_another_protocol_are_refused(own: Path, copy: Path) -> None:
 
 def test_a_change_of_scoring_keeps_the_images(own: Path, copy: Path) -> None:
     """What the method made is scored again, and the method itself is not asked."""
-    seconds = {c["images"]["0.png"]: c["seconds"] for c in read_results(greys_folder(copy)).cells}
+    seconds = {c.images["0.png"]: c.seconds for c in read_results(greys_folder(copy)).cells}
     assert run_greys(own, copy, "scoring.lpips=[vgg]") == 0
     again = read_results(greys_folder(copy)).cells
     assert len(again) == 4
-    assert "lpips_vgg" in again[0]["metrics"]
-    assert {c["images"]["0.png"]: c["seconds"] for c in again} == seconds
+    assert "lpips_vgg" in again[0].metrics
+    assert {c.images["0.png"]: c.seconds for c in again} == seconds
+    assert all(c.truths_apart for c in again)
 
 
 def test_quick_is_a_part_of_the_same_table(own: Path, finished: Path, tmp_path: Path) -> None:
     assert run_greys(own, tmp_path, quick=True) == 0
     quick = read_results(greys_folder(tmp_path))
-    assert {cell["sequence"] for cell in quick.cells} == {"0000"}
-    assert {c["key"] for c in quick.cells} < {
-        c["key"] for c in read_results(greys_folder(finished)).cells
+    assert {cell.sequence for cell in quick.cells} == {"0000"}
+    assert {c.key for c in quick.cells} < {
+        c.key for c in read_results(greys_folder(finished)).cells
     }
 
 
@@ -245,7 +251,7 @@ def test_compare_keeps_draws_apart_and_refuses_other_photographs(
 def test_two_runs_on_one_folder_do_not_mix(own: Path, copy: Path) -> None:
     from filelock import FileLock
 
-    with FileLock(copy / "greys" / ".lock"), pytest.raises(InputError, match="another process"):
+    with FileLock(copy / "greys" / ".run.lock"), pytest.raises(InputError, match="another process"):
         run_greys(own, copy)
 
 
@@ -274,6 +280,7 @@ def test_a_cluster_makes_the_same_table(own: Path, finished: Path, tmp_path: Pat
     import submitit
 
     executor = submitit.LocalExecutor(tmp_path / "submitted")
+    executor.update_parameters(timeout_min=30)
     launcher = SubmittedLauncher(executor, tasks=2, poll_seconds=0.05)
     assert run_greys(own, tmp_path, launcher=launcher) == 0
     pd.testing.assert_frame_equal(_table(tmp_path), _table(finished))

@@ -14,7 +14,7 @@ from tests.benchmarks.tables import greys_folder, run_greys
 
 def test_a_changed_picture_is_noticed(own: Path, copy: Path) -> None:
     folder = greys_folder(copy)
-    assert verify(folder) == Verification(cells=4, unchecked={})
+    assert verify(folder) == Verification(cells=4, apart=4)
     picture = next(copy.glob("greys/cells/*/0.png"))
     picture.write_bytes(picture.read_bytes()[:-1] + b"!")
     with pytest.raises(InputError, match="not what its cell's hash says"):
@@ -29,9 +29,11 @@ def test_verify_finds_a_forged_number_truth_and_protocol(copy: Path) -> None:
     record["metrics"]["psnr"]["value"] += 0.5
     file.write_text(json.dumps(record))
     assert any("psnr is stated as" in problem for problem in verify(folder).problems)
-    mask = next(copy.glob("greys/scenes/*/masks/0.png"))
-    mask.write_bytes(next(copy.glob("greys/scenes/*/truth/0.png")).read_bytes())
-    assert any("masks/0.png is not what its hash says" in p for p in verify(folder).problems)
+    mask = next(copy.glob("greys/truths/*/masks/0.png"))
+    mask.write_bytes(next(copy.glob("greys/truths/*/truth/0.png")).read_bytes())
+    assert any(
+        "masks/0.png is missing, or not what its hash says" in p for p in verify(folder).problems
+    )
     protocol = folder.protocol.read_text()
     folder.protocol.write_text(protocol.replace('"pool": 9', '"pool": 8'))
     assert any("not what its hash" in problem for problem in verify(folder).problems)
@@ -87,7 +89,7 @@ def test_geometry_is_scored_kept_and_verified(own: Path, copy: Path) -> None:
     assert (table["solid", "accuracy_distance"] > 0.01).all()
     assert table["dark", "f_score"].isna().all()
     folder = greys_folder(copy)
-    assert verify(folder) == Verification(cells=4, unchecked={})
+    assert verify(folder) == Verification(cells=4, apart=4)
     cloud = next(copy.glob("greys/cells/*/points.npy"))
     cloud.write_bytes(cloud.read_bytes()[:-1] + b"!")
     with pytest.raises(InputError, match="not what its cell's hash says"):

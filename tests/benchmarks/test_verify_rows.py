@@ -83,7 +83,7 @@ def test_a_plan_that_does_not_say_what_made_its_rows_is_refused(copy: Path) -> N
         lambda plan: plan.update(table=[]),
         lambda plan: plan["table"].update(name="../elsewhere"),
         lambda plan: plan["table"].update(captures=3),
-        lambda plan: plan["table"].update(unknown=3),
+        lambda plan: plan["table"].update(title=3),
         lambda plan: plan.update(cells=[3]),
         lambda plan: plan.update(cells=["../../elsewhere"]),
         lambda plan: plan.update(cells=2 * plan["cells"]),
@@ -97,7 +97,7 @@ def test_a_damaged_plan_is_one_line(
 ) -> None:
     _edit(greys_folder(copy).plan, edit)
     assert main(["verify", str(greys_folder(copy).path)]) == 1
-    _require_line(capsys.readouterr().err, "plan.json: is no table's plan")
+    _require_line(capsys.readouterr().err, "plan.json: ")
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_a_damaged_plan_is_one_line(
         lambda cell: cell.update(points=3),
         lambda cell: cell.update(metrics={"psnr": 3.0}),
         lambda cell: cell["metrics"]["psnr"].update(per_image=3),
-        lambda cell: cell["metrics"]["psnr"].update(other=3),
+        lambda cell: cell["metrics"]["psnr"].update(reason=3),
         lambda cell: cell.update(seconds="3"),
         lambda cell: cell.update(scene="../scenes"),
         lambda cell: cell.update(n_views="3"),
@@ -125,7 +125,7 @@ def test_a_damaged_cell_is_one_line(
 ) -> None:
     _edit(_cell_of(copy, "dark"), edit)
     assert main(["verify", str(greys_folder(copy).path)]) == 1
-    _require_line(capsys.readouterr().err, "cell.json: is no record of this cell")
+    _require_line(capsys.readouterr().err, "cell.json: ")
 
 
 def _require_line(message: str, said: str) -> None:
