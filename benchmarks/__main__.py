@@ -4,13 +4,16 @@ import argparse
 import importlib
 import sys
 from collections.abc import Callable, Sequence
+from importlib.metadata import version
 from pathlib import Path
 
 from benchmarks.catalogue import Catalogue
 from benchmarks.table_checks import check_table, lpips_weights_of, require_output_alone
-from extrap_train.config import CATEGORIES
+from extrap_train.config import CATEGORIES, TableConfig
 from extrap_train.errors import InputError
 from extrap_train.exits import Ended, ends_in_one_line
+from extrap_train.help_text import option_rows
+from extrap_train.text_values import yaml_words
 
 PERF_NAMES = ("align", "depth", "gaussians", "prep", "sample", "train", "warp")
 KINDS = ("methods", "tables", "categories")
@@ -53,6 +56,7 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="benchmark", description=__doc__)
+    parser.add_argument("--version", action="version", version=version("extrap-train"))
     commands = parser.add_subparsers(dest="command", required=True)
 
     def command(
@@ -65,6 +69,10 @@ def _parser() -> argparse.ArgumentParser:
     def with_table(sub: argparse.ArgumentParser) -> None:
         sub.add_argument("table", help="a name of `benchmark list tables`")
         sub.add_argument("overrides", nargs="*", metavar="key=value", help="e.g. methods=[ours]")
+        sub.formatter_class = argparse.RawDescriptionHelpFormatter
+        sub.epilog = (
+            f"options of a table, each table with values of its own:\n{option_rows(TableConfig)}"
+        )
         _add_config_dir(sub)
 
     listing = command("list", _list, "what there is")
@@ -142,7 +150,7 @@ def _description(catalogue: Catalogue, kind: str, name: str) -> str:
 
 def _run(options: argparse.Namespace) -> int:
     catalogue = Catalogue.with_own(options.config_dir)
-    table = catalogue.table(options.table, options.overrides)
+    table = catalogue.table(options.table, yaml_words(options.overrides, TableConfig))
     check_table(table, catalogue)  # a typing error is told before anything heavy loads
     from benchmarks.runner import RunOptions, run_table
 
@@ -156,7 +164,7 @@ def _run(options: argparse.Namespace) -> int:
 def _report(options: argparse.Namespace) -> int:
     catalogue = Catalogue.with_own(options.config_dir)
     require_output_alone(options.overrides)
-    table = catalogue.table(options.table, options.overrides)
+    table = catalogue.table(options.table, yaml_words(options.overrides, TableConfig))
     from benchmarks.plan import TableFolder
     from benchmarks.report import laid_out, write_reports
     from benchmarks.results import read_results

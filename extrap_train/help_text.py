@@ -40,6 +40,11 @@ def help_text(options: CommandOptions, own_folders: Sequence[str] = ()) -> str:
     return "\n".join(parts)
 
 
+def option_rows(tree: type) -> str:
+    """A line for every option of a tree."""
+    return _rows(_row(option) for option in options_of(tree).values() if option.declared.help)
+
+
 def _sections(options: CommandOptions) -> Iterator[tuple[str, list[Option]]]:
     """Options of the command itself, of each of its parts, and of each variant of a group."""
     own = options_of(options.tree)

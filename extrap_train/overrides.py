@@ -17,6 +17,7 @@ from extrap_train.command_options import CommandOptions, choices_of, suggest
 from extrap_train.config import Option
 from extrap_train.errors import InputError
 from extrap_train.option_errors import unknown_option
+from extrap_train.text_values import split_at_commas
 
 _FLAGS_WITH_VALUE = (
     *("--config-dir", "-cd", "--config-path", "-cp", "--config-name", "-cn"),
@@ -129,22 +130,6 @@ class CommandLine:
             return value
         quote = Quote.single if '"' in value else Quote.double
         return QuotedString(_without_interpolation(value), quote).with_quotes()
-
-
-def split_at_commas(text: str, *, lists: bool = False) -> list[str]:
-    """The parts between commas that stand in no quotes, nor, of `lists`, in their brackets."""
-    parts, depth, quote, start = [], 0, "", 0
-    for at, letter in enumerate(text):
-        if quote:
-            quote = "" if letter == quote else quote
-        elif letter in "\"'" and not text[start:at].strip():
-            quote = letter  # one within a word, as in it's, is a letter
-        elif lists and letter in "[]":
-            depth += 1 if letter == "[" else -1
-        elif letter == "," and depth == 0:
-            parts.append(text[start:at])
-            start = at + 1
-    return [*parts, text[start:]]
 
 
 def _without_interpolation(text: str) -> str:

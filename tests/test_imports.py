@@ -33,6 +33,7 @@ _RANK = {
     "extrap_train.option_errors": 3,
     "extrap_train.help_text": 3,
     "extrap_train.overrides": 4,
+    "extrap_train.text_values": 2,
     "extrap_train.runs": 5,
     "extrap_train.sweep": 5,
     "extrap_train.sweep_seeds": 2,

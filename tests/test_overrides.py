@@ -12,8 +12,9 @@ from omegaconf import OmegaConf
 
 from extrap_train.__main__ import main
 from extrap_train.cli import TRAIN
-from extrap_train.config import TrainConfig
+from extrap_train.config import TableConfig, TrainConfig
 from extrap_train.overrides import CommandLine
+from extrap_train.text_values import yaml_words
 
 
 def held(*words: str) -> dict[str, Any]:
@@ -157,3 +158,27 @@ def test_an_entry_of_a_mapping_is_text(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["it", *words])
     prepare()
     assert held[0].launcher.directives == {"constraint": "1e3"}
+
+
+def test_a_table_holds_texts_as_they_were_typed() -> None:
+    for text in _TEXTS:
+        word = f"scoring.lpips_weights.alex={text}"
+        given = OmegaConf.from_dotlist(yaml_words([f"output={text}", word], TableConfig))
+        values = OmegaConf.to_container(given, resolve=False)
+        assert values == {"output": text, "scoring": {"lpips_weights": {"alex": text}}}
+
+
+@pytest.mark.parametrize(
+    ("word", "value"),
+    [
+        ("captures.root=null", None),
+        ("captures.scenes=[a b (1),2024_05_01,it's]", ["a b (1)", "2024_05_01", "it's"]),
+        ('methods=["ours",inpainted]', ["ours", "inpainted"]),
+        ("methods=[]", []),
+        ("rules.views=[3,6]", [3, 6]),
+        ("options.ours.steps=4", 4),
+    ],
+)
+def test_other_values_of_a_table_are_yaml(word: str, value: Any) -> None:
+    (read,) = yaml_words([word], TableConfig)
+    assert OmegaConf.select(OmegaConf.from_dotlist([read]), word.partition("=")[0]) == value

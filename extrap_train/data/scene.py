@@ -30,7 +30,7 @@ def open_scene(spec: str, synthetic: SyntheticConfig | None = None) -> Sequence:
         return _open_synthetic(spec, synthetic or SyntheticConfig())
     if spec.startswith(CO3D_SCHEME):
         return _open_co3d(spec)
-    folder = Path(spec).expanduser()
+    folder = _expanded(spec)
     if not folder.is_dir():
         raise InputError(f"scene {spec!r}: no such folder; give {KNOWN_FORMS}")
     if (folder / TRANSFORMS).is_file():
@@ -46,11 +46,19 @@ def scene_address(spec: str) -> str:
     if spec.startswith(SYNTHETIC_SCHEME):
         return spec
     scheme = CO3D_SCHEME if spec.startswith(CO3D_SCHEME) else ""
-    return f"{scheme}{Path(spec.removeprefix(scheme)).expanduser().resolve()}"
+    return f"{scheme}{_expanded(spec.removeprefix(scheme)).resolve()}"
+
+
+def _expanded(spec: str) -> Path:
+    """`~` and `~NAME` as a home folder, if there is one of that name."""
+    try:
+        return Path(spec).expanduser()
+    except RuntimeError:  # a folder's own name begins with ~
+        return Path(spec)
 
 
 def _open_co3d(spec: str) -> Sequence:
-    path = Path(spec.removeprefix(CO3D_SCHEME)).expanduser()
+    path = _expanded(spec.removeprefix(CO3D_SCHEME))
     if len(path.parts) < 3:
         raise InputError(f"scene {spec!r}: is not co3d:ROOT/category/sequence; give all three")
     sequence = read_sequence(path.parent.parent, path.parent.name, path.name)
