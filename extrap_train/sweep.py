@@ -11,7 +11,7 @@ import io
 import math
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -67,7 +67,7 @@ class SweepTable(Callback):
             self._held = ExitStack()
             self._held.enter_context(file_lock(folder / ".sweep.lock", taken))
             remove_leftovers(folder)
-            manifest = Manifest.of({"overrides": list(config.hydra.overrides.task)})
+            manifest = Manifest.of(_options(config.hydra.overrides.task))
             if (folder / MANIFEST).exists() or (folder / _TABLE).exists():
                 require_same(folder, manifest, "give another hydra.sweep.dir")
             else:
@@ -123,18 +123,21 @@ def row_of(number: int, seconds: float, job: JobReturn) -> Row:
     value = job._return_value
     outcome = value if isinstance(value, Outcome) else None
     folder = outcome.folder if outcome else value if isinstance(value, Path) else None
-    overrides = dict(word.lstrip("+~").partition("=")[::2] for word in job.overrides or ())
     failed = job.status is not JobStatus.COMPLETED
     reason = f"{type(value).__name__}: {' '.join(str(value).split())}" if failed else ""
     return {
         "job": str(number),
         "status": FAILED if failed else REUSED if outcome and outcome.is_reused else OK,
         "seconds": f"{seconds:.1f}",
-        **overrides,
+        **_options(job.overrides or ()),
         **{METRIC + name: repr(x) for name, x in (metrics_at(folder) if folder else {}).items()},
         "folder": str(folder or ""),
         "reason": reason,
     }
+
+
+def _options(overrides: Iterable[str]) -> dict[str, str]:
+    return dict(word.lstrip("+~").partition("=")[::2] for word in overrides)
 
 
 def _give_objective(job: JobReturn, row: Row, objective: str) -> None:

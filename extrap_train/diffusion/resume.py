@@ -124,7 +124,7 @@ def newest_intact(folder: Path, say: Callable[[str], None]) -> Path | None:
         damage = find_damage(path)
         if damage is None:
             return path
-        say(f"{path}: damaged ({damage}); the checkpoint before it is used")
+        say(f"{path}: passed over, damaged ({damage})")
     return None
 
 
