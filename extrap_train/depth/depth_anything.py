@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from huggingface_hub.errors import StrictDataclassError
 from jaxtyping import Float
 from safetensors import SafetensorError
 from torch import Tensor
@@ -18,7 +19,17 @@ from extrap_train.device import fastest_device
 from extrap_train.errors import InputError
 from extrap_train.weight_files import WeightFile
 
-_UNUSABLE = (OSError, ValueError, KeyError, TypeError, RuntimeError, SafetensorError)
+_UNUSABLE = (
+    OSError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    ArithmeticError,
+    RuntimeError,
+    SafetensorError,
+    StrictDataclassError,
+)
 """What transformers raises on folders that hold nothing of its own, or something else."""
 
 _HARMLESS: dict[str, Any] = {"local_files_only": True, "trust_remote_code": False}
@@ -122,15 +133,18 @@ def _require_plausible(model: str) -> None:
                     raise _refusal(model, f"says {key}={value} in its {name}, at most {most}")
 
 
-def _settings(model: str, file: Path) -> Any:
+def _settings(model: str, file: Path) -> dict[str, Any]:
     try:
         if file.stat().st_size > _MAX_SETTINGS_BYTES:
             raise _refusal(model, f"has a {file.name} larger than any settings")
-        return json.loads(file.read_bytes())
+        settings = json.loads(file.read_bytes())
     except OSError as error:
         raise _refusal(model, f"{file.name} cannot be read ({error.strerror})") from None
     except (ValueError, RecursionError):
         raise _refusal(model, f"{file.name} is not valid JSON") from None
+    if not isinstance(settings, dict):
+        raise _refusal(model, f"{file.name} is no table of settings")
+    return settings
 
 
 def _require_no_larger_than_files(model: str, config: Any) -> None:

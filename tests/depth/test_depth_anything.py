@@ -112,7 +112,7 @@ def test_truncated_or_incomplete_weights(folder):
     refused(folder, "is cut off")
     weights.unlink()
     torch.save({}, folder / "pytorch_model.bin")  # pickles are not read
-    refused(folder, "cannot be read")
+    refused(folder, "holds 0 numbers")
 
 
 def test_code_in_the_folder_is_refused_without_a_question(folder, tmp_path, monkeypatch):
