@@ -2,6 +2,7 @@
 its result.
 """
 
+import io
 import json
 import os
 import shutil
@@ -9,11 +10,14 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import redirect_stdout
 from pathlib import Path
 
 import pandas as pd
 import pytest
 from tiny_job import TINY
+
+from extrap_train.__main__ import main
 
 _OPTIONS = [
     *TINY,
@@ -26,10 +30,14 @@ _OPTIONS = [
 ]
 
 
+def _arguments(output: Path, *more: str) -> list[str]:
+    return [*_OPTIONS, f"output={output}", *more]
+
+
 def _start(
-    output: Path, *more: str, program: tuple[str, str] = ("-m", "extrap_train")
+    output: Path, program: tuple[str, str] = ("-m", "extrap_train")
 ) -> "subprocess.Popen[bytes]":
-    command = [sys.executable, *program, *_OPTIONS, f"output={output}", *more]
+    command = [sys.executable, *program, *_arguments(output)]
     environment = os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     with (output / "log.txt").open("wb") as log:
         return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
@@ -40,10 +48,11 @@ def _said(output: Path) -> str:
 
 
 def _finish(output: Path, *more: str) -> str:
-    process = _start(output, *more)
-    process.wait(timeout=300)
-    assert process.returncode == 0, _said(output)
-    return _said(output)
+    """Run the job in this process, to its end."""
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()) as said:
+        patch.setattr(sys, "argv", ["extrap_train", *_arguments(output, *more)])
+        main()
+    return said.getvalue()
 
 
 @pytest.fixture(scope="module")
