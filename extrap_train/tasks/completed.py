@@ -133,7 +133,7 @@ def _print_what_was_added(
     added, points = summary["points_of_generated_views"], summary["points"]
     if done.steps and added < _NOTHING_SHARE * points:
         console.print(
-            f"the {len(done.steps)} generated views added next to nothing ({added} of {points} "
+            f"the generated views added next to nothing ({added} of {points} "
             "points): the photographs show nearly everything already; fewer inputs from one side "
             "(complete.draw=one_sided inputs=3) leave more to complete"
         )
