@@ -1,5 +1,6 @@
 """How the kernels are compiled."""
 
+import os
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -37,17 +38,18 @@ def _compile_once(dispatcher: Any) -> None:
     two types, one could load the other's code.
     """
     compile_or_load = dispatcher.compile
-    lock = _lock(dispatcher.stats.cache_path)
+    folder = dispatcher.stats.cache_path
 
     def compile_alone(signature: Any) -> Any:
         # numba's own lock between threads first: kernels compile the kernels that they call.
-        with global_compiler_lock, lock:
+        with global_compiler_lock, _lock(folder, os.getpid()):
             return compile_or_load(signature)
 
     dispatcher.compile = compile_alone
 
 
 @cache
-def _lock(folder: str) -> FileLock:
-    """The folder's one lock, which whoever holds it may take again for the kernels within."""
+def _lock(folder: str, process: int) -> FileLock:
+    """A process's one lock of a folder, which whoever holds it may take again for the kernels
+    within. A forked process must not use its parent's."""
     return FileLock(Path(folder) / "numba.lock")

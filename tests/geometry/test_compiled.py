@@ -1,5 +1,6 @@
 """Kernels are compiled once, by one process at a time, and then read from disk."""
 
+import os
 import threading
 from pathlib import Path
 
@@ -43,3 +44,12 @@ def test_a_kernel_waits_for_another_process_that_compiles(cache: Path) -> None:
         assert not kernel.signatures
     caller.join(60)
     assert len(kernel.signatures) == 1
+
+
+def test_a_forked_process_compiles_what_its_parent_has_not(cache: Path) -> None:
+    kernel = compiled()(double)
+    assert kernel(3) == 6
+    child = os.fork()
+    if child == 0:
+        os._exit(0 if kernel(1.5) == 3 else 1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
