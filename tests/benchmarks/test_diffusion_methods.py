@@ -258,13 +258,11 @@ def test_the_ablations_rows_run_as_their_files_say(weights: str, tmp_path: Path)
     words = [*small, *scoring, *tiny, "options.ours_lora.lora_steps=2", f"output={tmp_path}"]
     table = catalogue.table("ablation", words)
     assert run_table(table, catalogue, RunOptions(quick=True, launcher=LocalLauncher(1))) == 0
-    cells = {
-        cell["method"]: cell for cell in read_results(TableFolder(tmp_path / "ablation")).cells
-    }
+    cells = {cell.method: cell for cell in read_results(TableFolder(tmp_path / "ablation")).cells}
     assert list(cells) == rows
-    assert {cell["status"] for cell in cells.values()} == {"ok"}
-    assert cells["ours_lora"]["counts"]["adaptation_steps"] == 2
-    assert cells["ours_completed"]["metrics"]["f_score"]["value"] is not None
-    pictures = {name: tuple(cell["images"].values()) for name, cell in cells.items()}
+    assert {cell.status for cell in cells.values()} == {"ok"}
+    assert cells["ours_lora"].counts["adaptation_steps"] == 2
+    assert cells["ours_completed"].metrics["f_score"].value is not None
+    pictures = {name: tuple(cell.images.values()) for name, cell in cells.items()}
     assert pictures["ours"] == pictures["ours_base"]  # a copy of the same tiny model
     assert len(set(pictures.values())) >= 3
