@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.files import array_of, images_of
+from benchmarks.files import array_of, pictures_of
 from extrap_train.data.images import (
     read_depth,
     read_depth_mask,
@@ -205,8 +205,8 @@ def _readings(path: Path) -> Iterator[Callable[[], object]]:
     yield lambda: read_depth(path, SIZE, 0.001)
     if path.is_file() and not path.is_symlink():
         content = path.read_bytes()
-        yield lambda: images_of({path.name: content})
-        yield lambda: array_of(content)
+        yield lambda: pictures_of({path: content}, SIZE[0])
+        yield lambda: array_of(content, (None, 3), path)
 
 
 def _read_all(folder: Path) -> tuple[list[str], int]:
