@@ -57,10 +57,10 @@ def test_a_line_and_a_point_and_a_panorama_are_no_circles() -> None:
     assert "covers" in judge(capture(looking_at(line, np.zeros(3))), OPTIONS).reason
     tripod = ring(even(24))
     tripod.world_to_cam[:, :3, 3] = 0
-    assert "stand in one place" in judge(capture(tripod), OPTIONS).reason
+    assert "one place" in judge(capture(tripod), OPTIONS).reason
     outwards = ring(even(24), 0)
     outwards.world_to_cam[:, [0, 2]] *= -1
-    assert "face a common centre" in judge(capture(outwards), OPTIONS).reason
+    assert not judge(capture(outwards), OPTIONS).kept
 
 
 def test_overhead_views_do_not_fill_a_gap() -> None:
