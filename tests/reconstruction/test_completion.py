@@ -185,7 +185,7 @@ def test_nothing_known_is_changed_by_what_comes_later(whole):
 def test_resumed_from_disk_it_is_the_same_bit_for_bit(whole, tmp_path):
     known, _ = whole
     for index, view in enumerate(known.views[:7]):
-        save_view(view, tmp_path, index)
+        save_view(view, None, tmp_path, index)
     loaded = load_map(tmp_path, known.tolerance)
     resumed, steps = completed(loaded)
     assert len(steps) == len(known) - 7
