@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from http import HTTPStatus
 from typing import Any
+from unittest.mock import patch
 from urllib.parse import urlsplit
 
 from websockets.asyncio import server
@@ -56,11 +57,8 @@ def answer_own_pages_only(host: str) -> Iterator[None]:
         guarded.append(True)
         return serve(*arguments, process_request=answer, **options)
 
-    server.serve = serve_own_pages  # type: ignore[assignment, misc]
-    try:
+    with patch.object(server, "serve", serve_own_pages):
         yield
-    finally:
-        server.serve = serve  # type: ignore[misc]
     if not guarded:
         raise RuntimeError("this viser does not start its server through websockets.asyncio.server")
 
