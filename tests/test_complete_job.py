@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
-from benchmarks.methods.gaussians.drawing import draw
-from benchmarks.methods.gaussians.ply import read_splats
-from benchmarks.methods.gaussians.rasterization import rasterizer
 from extrap_train.data.scene import open_scene
+from extrap_train.gaussians.drawing import draw
+from extrap_train.gaussians.ply import read_splats
+from extrap_train.gaussians.rasterization import rasterizer
 from extrap_train.metrics import psnr
 
 _TINY = [

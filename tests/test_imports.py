@@ -26,6 +26,7 @@ _RANK = {
     "extrap_train.metrics": 3,
     "extrap_train.pictures": 4,
     "extrap_train.processes": 4,
+    "extrap_train.gaussians": 5,
     "extrap_train.diffusion": 5,
     "extrap_train.terminal": 1,
     "extrap_train.exits": 1,

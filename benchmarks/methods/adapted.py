@@ -6,7 +6,6 @@ from lightning.fabric import Fabric
 from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 
 from benchmarks.methods.base import SceneInputs
-from benchmarks.methods.checks import check_range
 from benchmarks.methods.diffusion import Diffusion, Painted
 from benchmarks.methods.references import views_with_depth
 from extrap_train.config import LoraConfig
@@ -14,6 +13,7 @@ from extrap_train.data.scene_pairs import adaptation_pairs
 from extrap_train.diffusion.adaptation import adapt
 from extrap_train.diffusion.lora import temporary_adapter
 from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.gaussians.checks import check_range
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis, Unavailable, photographs_used
-from benchmarks.methods.checks import check_range
 from benchmarks.methods.references import views_with_depth
 from extrap_train.config import NEAREST_ALONE, SamplerConfig, SamplerOptions, sampler_for
 from extrap_train.diffusion.checkpoint import load_model
@@ -19,6 +18,7 @@ from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.packaged import packaged_name, packaged_weights
 from extrap_train.errors import InputError
+from extrap_train.gaussians.checks import check_range
 
 
 @dataclass(frozen=True)

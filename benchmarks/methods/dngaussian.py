@@ -7,23 +7,23 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from benchmarks.methods.checks import check_range, check_word
-from benchmarks.methods.gaussians.density import remove
-from benchmarks.methods.gaussians.depth_losses import (
+from benchmarks.methods.gaussian_method import GaussianMethod
+from extrap_train.gaussians.checks import check_range, check_word
+from extrap_train.gaussians.density import remove
+from extrap_train.gaussians.depth_losses import (
     edge_aware_smoothness,
     filled,
     patch_depth_loss,
 )
-from benchmarks.methods.gaussians.drawing import Drawing, draw
-from benchmarks.methods.gaussians.gaussians import Gaussians
-from benchmarks.methods.gaussians.method import GaussianMethod
-from benchmarks.methods.gaussians.nearest import nearest_expected
-from benchmarks.methods.gaussians.neural_colour import HashGrid, NeuralColor
-from benchmarks.methods.gaussians.parameters import GaussianParameters
-from benchmarks.methods.gaussians.priors import monocular_source, prior_depths
-from benchmarks.methods.gaussians.recipe import Objective, Recipe, Step, Training
-from benchmarks.methods.gaussians.scene import TrainingScene
-from benchmarks.methods.gaussians.schedule import LEAST_BETWEEN_GROWTH
+from extrap_train.gaussians.drawing import Drawing, draw
+from extrap_train.gaussians.gaussians import Gaussians
+from extrap_train.gaussians.nearest import nearest_expected
+from extrap_train.gaussians.neural_colour import HashGrid, NeuralColor
+from extrap_train.gaussians.parameters import GaussianParameters
+from extrap_train.gaussians.priors import monocular_source, prior_depths
+from extrap_train.gaussians.recipe import Objective, Recipe, Step, Training
+from extrap_train.gaussians.scene import TrainingScene
+from extrap_train.gaussians.schedule import LEAST_BETWEEN_GROWTH
 from extrap_train.views import Camera
 
 _OPAQUE = 0.2

@@ -6,15 +6,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks.methods.gaussians.depth_losses import pearson_depth_loss
-from benchmarks.methods.gaussians.drawing import Drawing
-from benchmarks.methods.gaussians.method import GaussianMethod
-from benchmarks.methods.gaussians.priors import monocular_source, prior_depths
-from benchmarks.methods.gaussians.pseudo_views import pseudo_camera
-from benchmarks.methods.gaussians.recipe import Recipe, Training
-from benchmarks.methods.gaussians.scene import TrainingScene
-from benchmarks.methods.gaussians.unpool import Pairing, unpooled
+from benchmarks.methods.gaussian_method import GaussianMethod
 from extrap_train.errors import InputError
+from extrap_train.gaussians.depth_losses import pearson_depth_loss
+from extrap_train.gaussians.drawing import Drawing
+from extrap_train.gaussians.priors import monocular_source, prior_depths
+from extrap_train.gaussians.pseudo_views import pseudo_camera
+from extrap_train.gaussians.recipe import Recipe, Training
+from extrap_train.gaussians.scene import TrainingScene
+from extrap_train.gaussians.unpool import Pairing, unpooled
 from extrap_train.views import View
 
 

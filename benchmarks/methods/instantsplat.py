@@ -7,12 +7,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from benchmarks.methods.gaussians.covisibility import unique_pixels
-from benchmarks.methods.gaussians.method import GaussianMethod
-from benchmarks.methods.gaussians.points import Points, joined, pixel_points
-from benchmarks.methods.gaussians.poses import PoseCorrections, similarity_between
-from benchmarks.methods.gaussians.recipe import Recipe
-from benchmarks.methods.gaussians.scene import TrainingScene
+from benchmarks.methods.gaussian_method import GaussianMethod
+from extrap_train.gaussians.covisibility import unique_pixels
+from extrap_train.gaussians.points import Points, joined, pixel_points
+from extrap_train.gaussians.poses import PoseCorrections, similarity_between
+from extrap_train.gaussians.recipe import Recipe
+from extrap_train.gaussians.scene import TrainingScene
 from extrap_train.views import Camera
 
 _STEADY, _LOOSE = 1.0, 100.0

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-from benchmarks.methods.gaussians.method import GaussianMethod
-from benchmarks.methods.gaussians.recipe import Recipe
-from benchmarks.methods.gaussians.scene import TrainingScene
+from benchmarks.methods.gaussian_method import GaussianMethod
+from extrap_train.gaussians.recipe import Recipe
+from extrap_train.gaussians.scene import TrainingScene
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from benchmarks.methods.gaussians.projection import LOW_PASS, NEAR_PLANE
-from benchmarks.methods.gaussians.projection_numba import LEAST_ALPHA
+from extrap_train.gaussians.projection import LOW_PASS, NEAR_PLANE
+from extrap_train.gaussians.projection_numba import LEAST_ALPHA
 from extrap_train.geometry.cameras import pixel_grid
 from extrap_train.views import Camera
 

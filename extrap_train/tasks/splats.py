@@ -10,15 +10,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks.methods.gaussians.drawing import draw
-from benchmarks.methods.gaussians.fit_views import fit_views
-from benchmarks.methods.gaussians.gaussians import Gaussians
-from benchmarks.methods.gaussians.options import BACKGROUNDS, GaussianOptions
-from benchmarks.methods.gaussians.ply import read_comments, read_splats, write_splats
-from benchmarks.methods.gaussians.rasterization import rasterizer
 from extrap_train.config import SplatsConfig
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError
+from extrap_train.gaussians.drawing import draw
+from extrap_train.gaussians.fit_views import fit_views
+from extrap_train.gaussians.gaussians import Gaussians
+from extrap_train.gaussians.options import BACKGROUNDS, GaussianOptions
+from extrap_train.gaussians.ply import read_comments, read_splats, write_splats
+from extrap_train.gaussians.rasterization import rasterizer
 from extrap_train.metrics import psnr, quantised
 from extrap_train.pictures import contact_sheet, error_map
 from extrap_train.reconstruction.global_map import GlobalMap

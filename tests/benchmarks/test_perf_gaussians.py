@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from benchmarks.methods.gaussians.rasterization import rasterizer
 from benchmarks.perf.gaussians import cube_of_gaussians
 from benchmarks.perf.gaussians_reference import rasterize_reference
 from benchmarks.perf.timing import compare
 from benchmarks.perf.warp import orbit_camera
 from extrap_train.errors import InputError
+from extrap_train.gaussians.rasterization import rasterizer
 
 SIZE = 40
 

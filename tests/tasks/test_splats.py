@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks.methods.gaussians.ply import read_splats
-from benchmarks.methods.gaussians.trainer import Diverged
 from extrap_train.config import SplatsConfig
+from extrap_train.gaussians.ply import read_splats
+from extrap_train.gaussians.trainer import Diverged
 from extrap_train.reconstruction.global_map import GlobalMap, Origin
 from extrap_train.reconstruction.inputs import WorldUnit
 from extrap_train.tasks import splats as task

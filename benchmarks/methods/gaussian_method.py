@@ -1,0 +1,59 @@
+"""A Gaussian method as a row of a table."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis, photographs_used
+from extrap_train.gaussians.options import GaussianOptions
+from extrap_train.gaussians.parameters import parameters_from_points
+from extrap_train.gaussians.points import Points
+from extrap_train.gaussians.recipe import Recipe
+from extrap_train.gaussians.scene import TrainingScene, training_scene
+from extrap_train.gaussians.trainer import Fit, fit
+
+
+@dataclass(frozen=True)
+class GaussianMethod(GaussianOptions, ABC):
+    """Fits Gaussians to the inputs and draws the targets; a subclass names its recipe."""
+
+    @abstractmethod
+    def recipe(self, scene: TrainingScene) -> Recipe:
+        """What the method does in the training loop."""
+
+    def weight_files(self, category: str) -> Sequence[Path]:
+        """None."""
+        return ()
+
+    def fitted(self, inputs: SceneInputs) -> Fit:
+        """The scene that the inputs alone make; the targets are not looked at."""
+        return fit(self.recipe(training_scene(inputs.views, inputs.depth_source, inputs.seed)))
+
+    def synthesize(self, inputs: SceneInputs) -> Synthesis:
+        """Fit, and draw every target; the time is that of preprocessing and optimisation."""
+        self._warm_up(inputs)
+        with Stopwatch() as watch:
+            trained = self.fitted(inputs)
+        return Synthesis(
+            images=trained.render(inputs.targets),
+            seconds=watch.seconds,
+            given=trained.record | photographs_used(inputs.views),
+            points=trained.seen_surface(),
+            counts={"gaussians": float(len(trained.parameters.means))},
+        )
+
+    def _warm_up(self, inputs: SceneInputs) -> None:
+        """Draw one Gaussian forwards and backwards: the first drawing of a process waits for the
+        rasteriser to be compiled and loaded, which would fall to whichever cell comes first.
+        """
+        point = Points(torch.zeros(1, 3), torch.zeros(1, 3), torch.ones(1))
+        parameters = parameters_from_points(point, self.sh_degree, opacity=0.5, widest=0.1)
+        learnt = parameters.to(self.device)
+        for values in learnt.tensors().values():
+            values.requires_grad_()
+        scene = training_scene(inputs.views, inputs.depth_source, inputs.seed)
+        recipe = Recipe(self, scene)
+        recipe.draw(learnt, recipe.camera(0)).image.sum().backward()

@@ -1,0 +1,225 @@
+"""The one training loop of all Gaussian methods."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from extrap_train.errors import InputError
+from extrap_train.gaussians.density import GrowthStatistics
+from extrap_train.gaussians.drawing import Drawing
+from extrap_train.gaussians.gaussians import Gaussians
+from extrap_train.gaussians.optimiser import GaussianOptimiser
+from extrap_train.gaussians.options import GaussianOptions
+from extrap_train.gaussians.parameters import (
+    GaussianParameters,
+    from_tensors,
+    parameters_from_points,
+)
+from extrap_train.gaussians.points import Points
+from extrap_train.gaussians.recipe import Recipe, Training
+from extrap_train.gaussians.schedule import Schedule, exponential
+from extrap_train.geometry.cameras import unproject_to_world
+from extrap_train.views import Camera
+
+WIDEST_START = 0.05
+"""Of the distance to the nearest input camera: among a few hundred scattered points neighbours are
+so far that each Gaussian would cover a whole image, which is slow and shows nothing.
+"""
+FARTHEST = 1e5
+"""Distance from the scene's centre, in extents, that no Gaussian reaches on purpose."""
+LEAST_ALPHA = 0.5
+"""Of a pixel that shows a surface; with less, most of what it shows is behind the Gaussians."""
+
+
+class Diverged(InputError):
+    """The optimisation left the scene, or finite numbers altogether: there is no result."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A trained scene, on the device that it was fitted on; what it gives is on the CPU."""
+
+    parameters: GaussianParameters
+    recipe: Recipe
+
+    @torch.no_grad()
+    def render(self, targets: Camera) -> Float[Tensor, "n 3 h w"]:
+        """The images of cameras of the world (batched `n`), in [0, 1]."""
+        cameras = self.recipe.scene.frame.camera(targets).to(self.recipe.options.device)
+        cameras = self.recipe.target_cameras(cameras)
+        count = len(targets.world_to_cam)
+        drawn = [self.recipe.draw(self.parameters, cameras[i]).image for i in range(count)]
+        return torch.stack(drawn).clamp(0, 1).cpu()
+
+    @property
+    def record(self) -> dict[str, str]:
+        """What was used and what happened, in words."""
+        return self.recipe.scene.record
+
+    @torch.no_grad()
+    def seen_surface(self) -> Float[Tensor, "m 3"]:
+        """The surface that the inputs see, in the world: a point for every pixel of theirs with an
+        alpha above `LEAST_ALPHA`, on its ray at the expected depth.
+
+        The Gaussians' own centres would not do: after a short optimisation nearly all are faint,
+        and only together they hide what is behind.
+        """
+        points = []
+        for index in range(len(self.recipe.cameras)):
+            camera = self.recipe.camera(index)
+            drawing = self.recipe.draw(self.parameters, camera)
+            on_rays = unproject_to_world(drawing.depth, camera)
+            points.append(on_rays[drawing.alpha > LEAST_ALPHA])
+        return self.recipe.scene.frame.to_world(torch.cat(points)).cpu()
+
+    @torch.no_grad()
+    def gaussians(self) -> Gaussians:
+        """The Gaussians in the world that the input views were given in.
+
+        A network's colours are baked: the mean of what the inputs see, the same from everywhere.
+        """
+        frame = self.recipe.scene.frame
+        drawn = self.recipe.baked(self.parameters).gaussians()
+        return Gaussians(
+            frame.to_world(drawn.means), drawn.quats, drawn.scales * frame.unit,
+            drawn.opacities, drawn.sh,
+        ).to("cpu")  # fmt: skip
+
+
+def fit(recipe: Recipe, points: Points | None = None, show_progress: bool = False) -> Fit:
+    """Train from the recipe's own initial points, or from those given (in the frame, on the CPU).
+
+    The same recipe, points and seed give the same Gaussians on a CPU. Raises InputError without
+    usable points, `Diverged` where the loss or anything that is learnt stops being finite.
+    """
+    options = recipe.options
+    schedule = Schedule(options.iterations, options.full_iterations)
+    start = recipe.initial_points() if points is None else points
+    eyes = torch.stack([view.camera.center for view in recipe.scene.views])
+    widest = WIDEST_START * torch.cdist(start.positions, eyes).amin(1)
+    parameters = parameters_from_points(start, options.sh_degree, options.init_opacity, widest)
+    rates = learning_rates(options, schedule, progress=0.0)
+    parameters = parameters.to(options.device)
+    training = Training(
+        GaussianOptimiser(parameters, rates),
+        GrowthStatistics.empty(parameters.means),
+        schedule,
+        recipe.generator,
+    )
+    record = recipe.scene.record
+    record["schedule"] = (
+        f"{options.iterations} of {options.full_iterations} iterations, "
+        f"learning rates x {schedule.rate_factor:.3g}"
+    )
+    modules = _ModuleOptimiser(recipe.modules(), schedule)
+    order: list[int] = []
+    for step in tqdm(range(1, options.iterations + 1), disable=not show_progress, unit="it"):
+        training.iteration = step
+        if not order:
+            count = len(recipe.scene.views)
+            order = torch.randperm(count, generator=training.generator).tolist()
+        _iterate(recipe, training, modules, order.pop())
+    _check(training, modules)
+    return Fit(from_tensors({k: v.detach() for k, v in _tensors(training).items()}), recipe)
+
+
+def learning_rates(
+    options: GaussianOptions, schedule: Schedule, progress: float
+) -> dict[str, float]:
+    """Adam's learning rate of each parameter after a share of the training."""
+    factor = schedule.rate_factor
+    means = exponential(options.means_rate, options.means_rate_final, progress)
+    return {
+        "means": means * factor,
+        "log_scales": options.log_scales_rate * factor,
+        "quats": options.quats_rate * factor,
+        "opacity_logits": options.opacity_logits_rate,
+        "sh_dc": options.sh_dc_rate * factor,
+        "sh_rest": options.sh_rest_rate * factor,
+    }
+
+
+def _iterate(recipe: Recipe, training: Training, modules: "_ModuleOptimiser", index: int) -> None:
+    progress = training.iteration / recipe.options.iterations
+    rates = learning_rates(recipe.options, training.schedule, progress)
+    training.optimiser.set_rate("means", rates["means"])
+    for step in recipe.steps(training):
+        objective = step(training, index)
+        loss = objective.loss.detach()
+        if not loss.isfinite():
+            raise _diverged(f"the loss became {float(loss)}", training)
+        objective.loss.backward()
+        if objective.drawing is not None:
+            _watch(training.statistics, objective.drawing)
+        training.optimiser.step(recipe.means_factor)
+        modules.step(progress)
+        if not training.optimiser.parameters.means.detach().abs().max() < FARTHEST:
+            raise _diverged("a Gaussian left the scene", training)
+    _check(training, modules)
+    recipe.adapt(training)
+
+
+def _check(training: Training, modules: "_ModuleOptimiser") -> None:
+    """What a loss of finite numbers can hide: a Gaussian that is NaN is not drawn."""
+    for name, values in _tensors(training).items():
+        if not is_finite(values):
+            raise _diverged(f"{name} stopped being finite", training)
+    if not modules.is_finite():
+        raise _diverged("what is learnt beside the Gaussians stopped being finite", training)
+
+
+def is_finite(values: Float[Tensor, "..."]) -> bool:
+    """Whether no number is NaN or infinite, or so large that their sum is: one pass, where asking
+    every number took half the time of an iteration with a hash grid.
+    """
+    return bool(values.sum().isfinite())
+
+
+def _diverged(what: str, training: Training) -> Diverged:
+    return Diverged(
+        f"{what} in iteration {training.iteration} of {training.schedule.iterations}; "
+        "lower the learning rates or check the input"
+    )
+
+
+def _watch(statistics: GrowthStatistics, drawing: Drawing) -> None:
+    gradient = drawing.centers.grad
+    if gradient is not None:
+        height, width = drawing.depth.shape
+        radii = drawing.radii[0].amax(-1).float()
+        statistics.add(gradient[0], radii, height, width)
+
+
+def _tensors(training: Training) -> dict[str, Tensor]:
+    return training.optimiser.parameters.tensors()
+
+
+class _ModuleOptimiser:
+    """Adam for what is learnt beside the Gaussians, at rates that fall exponentially."""
+
+    def __init__(
+        self, modules: Sequence[tuple[nn.Module, float, float]], schedule: Schedule
+    ) -> None:
+        self._rates = [
+            (start * schedule.rate_factor, end * schedule.rate_factor) for _, start, end in modules
+        ]
+        self._learnt = [value for module, _, _ in modules for value in module.parameters()]
+        groups = [{"params": list(module.parameters())} for module, _, _ in modules]
+        self._adam = torch.optim.Adam(groups, eps=1e-15, fused=True) if groups else None
+
+    def is_finite(self) -> bool:
+        """Whether no number that is learnt is NaN or infinite."""
+        return all(is_finite(value.detach()) for value in self._learnt)
+
+    def step(self, progress: float) -> None:
+        """One step along the gradients, which are then forgotten."""
+        if self._adam is None:
+            return
+        for group, (start, end) in zip(self._adam.param_groups, self._rates, strict=True):
+            group["lr"] = exponential(start, end, progress)
+        self._adam.step()
+        self._adam.zero_grad(set_to_none=True)
