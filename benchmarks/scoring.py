@@ -101,7 +101,9 @@ def score_points(points: Float[Tensor, "m 3"] | None, truth: Truth) -> dict[str,
 
 
 def _of_images(values: Float[Tensor, " n"], reason: str) -> Score:
-    """Mean over the images that have the metric."""
+    """Mean over the images that have the metric; InputError for NaN without a reason for one."""
+    if not reason and not values.isfinite().all():
+        raise InputError("gives numbers that are not finite; its weights may be damaged")
     known = [None if math.isnan(v) else v for v in values.double().tolist()]
     present = [v for v in known if v is not None]
     if not present:

@@ -16,7 +16,9 @@ import pandas as pd
 import pytest
 from tiny_job import TINY
 
-_OPTIONS = [
+from tests.benchmarks.tables import write_own
+
+_TRAINED = [
     *TINY,
     "trainer.steps=12",
     "trainer.checkpoint_every=3",
@@ -25,22 +27,46 @@ _OPTIONS = [
     "validation.pictures=2",
     "sampler.steps=2",
 ]
-_COMMANDS = {"training": [], "sweep": ["-m", "seed=0,1"]}
+_PREPARED = [
+    "category=hydrant",
+    "data.train_sequences=2",
+    "data.test_sequences=1",
+    "data.frames=12",
+    "data.image_size=32",
+    "prep.image_size=32",
+    "prep.max_gap_deg=60",
+    "workers=1",
+]
+_COMMANDS = {
+    "training": ["extrap_train", *_TRAINED],
+    "sweep": ["extrap_train", "-m", "seed=0,1", *_TRAINED],
+    "preparation": ["data_prep", *_PREPARED],
+    "benchmark": ["benchmarks", "run", "greys", "methods=[dark,light]", "--workers", "1"],
+}
+_PREPARED_FOLDERS = ("data", "frames", "pairs")
+_MADE = {"training": ["train"], "sweep": ["train", "sweep"], "benchmark": ["greys"]}
+_MADE |= {"preparation": [*_PREPARED_FOLDERS]}
 _STATUS = {signal.SIGKILL: -signal.SIGKILL, signal.SIGINT: 130, signal.SIGTERM: 143}
 pytestmark = pytest.mark.slow
 
 
 def _start(output: Path, command: str) -> "subprocess.Popen[bytes]":
-    words = [*_COMMANDS[command], *_OPTIONS, f"output={output}"]
-    words += [f"hydra.sweep.dir={output / 'sweep'}"] if command == "sweep" else []
+    words = [*_COMMANDS[command], f"output={output}"]
+    if command == "sweep":
+        words += [f"hydra.sweep.dir={output / 'sweep'}"]
+    if command == "benchmark":
+        own = output.parent / "own"
+        words += ["--config-dir", str(own if own.is_dir() else write_own(own))]
     environment = os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     output.mkdir(exist_ok=True)
     with (output.parent / f"{output.name}.log").open("ab") as log:
         return subprocess.Popen(
-            [sys.executable, "-m", "extrap_train", *words],
+            [sys.executable, "-m", *words],
             stdout=log,
             stderr=subprocess.STDOUT,
             env=environment,
+            # A background shell's children ignore Ctrl-C.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         )
 
 
@@ -49,23 +75,32 @@ def _said(output: Path) -> str:
 
 
 def _results(output: Path) -> dict[str, object]:
-    """Weights by their bytes, tables without times, by their place in `output`."""
+    """Weights, pictures and pairs by their bytes, tables without times, by their place."""
     found: dict[str, object] = {}
-    for path in sorted(output.glob("train/*/*/seed*/**/*")):
-        name = str(path.relative_to(output))
-        if path.suffix == ".safetensors":
+    places = ["train/*/*/seed*", *_PREPARED_FOLDERS, "greys/cells"]
+    files = [path for place in places for path in output.glob(f"{place}/**/*") if path.is_file()]
+    for path in sorted(files):
+        part, name = path.relative_to(output).parts[0], str(path.relative_to(output))
+        wanted = path.suffix in (".safetensors", ".png")
+        wanted |= path.name in ("metrics.csv", "validation.csv")
+        wanted |= part in _PREPARED_FOLDERS and path.suffix != ".lock"
+        if wanted:
             found[name] = path.read_bytes()
-        if path.name in ("metrics.csv", "validation.csv"):
-            found[name] = path.read_text()
-    table = output / "sweep" / "sweep.csv"
-    if table.is_file():
-        rows = pd.read_csv(table).drop(columns=["seconds", "folder", "status"])
-        found["sweep.csv"] = rows.drop(columns="output").to_csv()
+    for table in ("sweep/sweep.csv", "greys/greys.csv"):
+        if (output / table).is_file():
+            rows = pd.read_csv(output / table)
+            rows = rows.drop(columns=[*{"seconds", "folder", "output"} & {*rows}])
+            if "metric" in rows:
+                rows = rows[~rows["metric"].isin(["seconds", "peak_memory_mib"])]
+            else:
+                rows = rows.drop(columns="status")  # `reused` after an interruption
+            found[table] = rows.to_csv()
+    assert found
     return found
 
 
 def _leftovers(output: Path) -> list[Path]:
-    return [path for path in output.rglob(".*.tmp*") if path.exists()]
+    return [*output.rglob(".*.tmp*"), *output.glob("greys/*/.*/")]
 
 
 @pytest.fixture(scope="module", params=list(_COMMANDS))
@@ -108,25 +143,32 @@ def _seconds(whole: Path, command: str, folder: Path) -> float:
     """How long the command takes where its data are there."""
     copy = folder / "timed"
     shutil.copytree(whole, copy, symlinks=True)
-    for part in ("train", "sweep"):
-        shutil.rmtree(copy / part, ignore_errors=True)
+    for part in _MADE[command]:
+        shutil.rmtree(copy / part)
     started = time.monotonic()
     assert _start(copy, command).wait(timeout=900) == 0, _said(copy)
     return time.monotonic() - started
 
 
+def _size(output: Path) -> int:
+    """Bytes of the blocks that the files take, as a file system in memory counts them."""
+    return sum(-(-path.stat().st_size // 4096) * 4096 for path in output.rglob("*"))
+
+
 @pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Callable[[int], Path]]:
-    """Mounts file systems of so many MiB; skips where that is not permitted."""
+def disk(tmp_path: Path) -> Iterator[Callable[[str], Path]]:
+    """Mounts file systems in memory with some options; skips where that is not permitted."""
     mounted: list[Path] = []
 
-    def mount(size_mib: int) -> Path:
-        place = tmp_path / f"disk-{size_mib}"
+    def mount(options: str) -> Path:
+        place = tmp_path / "disk"
         place.mkdir()
-        words = ["mount", "-t", "tmpfs", "-o", f"size={size_mib}m", "tmpfs", str(place)]
+        words = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(place)]
         if shutil.which("mount") is None or subprocess.run(words, capture_output=True).returncode:
             pytest.skip("mounting a file system is not permitted")
         mounted.append(place)
+        # What is said must not fill the disk, nor what the command needs.
+        (tmp_path / "disk.log").touch()
         return place
 
     yield mount
@@ -134,27 +176,34 @@ def small_disk(tmp_path: Path) -> Iterator[Callable[[int], Path]]:
         subprocess.run(["umount", str(place)], check=True)
 
 
-@pytest.mark.parametrize("size_mib", [1, 6, 14])
-def test_a_full_disk_is_one_line_and_the_command_goes_on_with_more_room(
-    undisturbed: tuple[str, Path],
-    tmp_path: Path,
-    small_disk: Callable[[int], Path],
-    size_mib: int,
-) -> None:
-    """Too small for the data, for a checkpoint, and for the second one with the model."""
-    command, whole = undisturbed
-    output = small_disk(size_mib) / "full"
-    log = tmp_path / f"disk-{size_mib}" / "full.log"
-    log.symlink_to(tmp_path / f"full-{size_mib}.log")  # what is said must not fill the disk
-    process = _start(output, command)
-    assert process.wait(timeout=900) == 1, _said(output)
-    said = _said(output)
+def _require_one_line(said: str) -> None:
     assert "Traceback" not in said
     errors = [line for line in said.splitlines() if line.startswith("error:")]
-    assert len(errors) == 1
+    assert len(errors) == 1, said
+
+
+@pytest.mark.parametrize("share", [0.15, 0.5, 0.9])
+def test_a_full_disk_is_one_line_and_the_command_goes_on_with_more_room(
+    undisturbed: tuple[str, Path], tmp_path: Path, disk: Callable[[str], Path], share: float
+) -> None:
+    """A share of what the results need."""
+    command, whole = undisturbed
+    output = disk(f"size={int(share * _size(whole))}")
+    process = _start(output, command)
+    assert process.wait(timeout=900) == 1, _said(output)
+    _require_one_line(_said(output))
     roomy = tmp_path / "roomy"
     shutil.copytree(output, roomy, symlinks=True)
     assert not _leftovers(roomy)
     process = _start(roomy, command)
     assert process.wait(timeout=900) == 0, _said(roomy)
     assert _results(roomy) == _results(whole)
+
+
+def test_a_disk_that_cannot_be_written_is_one_line(
+    undisturbed: tuple[str, Path], disk: Callable[[str], Path]
+) -> None:
+    command, _ = undisturbed
+    output = disk("ro")
+    assert _start(output, command).wait(timeout=900) == 1, _said(output)
+    _require_one_line(_said(output))

@@ -8,6 +8,7 @@ import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio
 
+from benchmarks import scoring
 from benchmarks.scenes import TrueSurface, Truth
 from benchmarks.scoring import megascenes_compat, score_images, score_points
 from extrap_train.config import ScoringConfig
@@ -92,6 +93,18 @@ def test_a_missing_backbone_is_an_empty_number_and_never_another_net(
     for name in ("lpips_alex", "lpips_vgg", "dists"):
         assert scores[name].value is None
         assert "no weights" in scores[name].reason
+
+
+def test_numbers_of_a_network_that_are_none_are_an_empty_number_with_its_reason(
+    truth: Truth, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One image's alone is enough: a mean over the others would be another metric."""
+    monkeypatch.setattr(
+        scoring, "_lpips", lambda *_: lambda images, truth: torch.tensor([0.1, math.nan])
+    )
+    score = score_images(truth.images, truth, ScoringConfig(lpips=["alex"], dists=False))
+    assert score["lpips_alex"].value is None
+    assert "not finite" in score["lpips_alex"].reason
 
 
 def test_lpips_is_named_by_its_net(truth: Truth, shared: Path) -> None:

@@ -2,6 +2,8 @@
 
 import json
 import os
+import socket
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,8 @@ from benchmarks.scenes import Scene
 from extrap_train.errors import InputError
 from extrap_train.jobs.slurm import SubmittedLauncher
 from tests.benchmarks.tables import greys_folder, run_greys
+
+HOST = socket.gethostname().partition(".")[0]
 
 
 def _table(output: Path) -> pd.DataFrame:
@@ -69,6 +73,23 @@ def test_a_second_run_uses_every_cell_again(
     assert run_greys(own, copy) == 0
     assert "4 finished and used again, 0 open" in capsys.readouterr().out
     assert {f: f.stat().st_ino for f in copy.glob("greys/cells/*/*")} == stamps
+
+
+def test_leftovers_of_killed_writers_are_gone_after_the_next_run(own: Path, copy: Path) -> None:
+    """Half-written cells, scenes and truths beside the whole ones, and files in the table."""
+    table = copy / "greys"
+    key = next(table.glob("cells/*")).name
+    scene = next(table.glob("scenes/*")).name
+    left = [table / "cells" / f".{key}.99999", table / "scenes" / f".{scene}.99999"]
+    left += [table / "cells" / f".{key}.{HOST}-999999.0a1b2c3d.tmp"]
+    left += [table / "truths" / f".{scene}.replaced.{HOST}-999999.tmp"]
+    left += [table / f".truths.{HOST}-999999.4d3c2b1a.tmp"]
+    for folder in left:
+        folder.mkdir()
+        (folder / "0.png").write_bytes(b"half")
+    (table / f".greys.csv.{HOST}-999999.tmp").write_bytes(b"half")
+    assert run_greys(own, copy) == 0
+    assert {path.name for path in table.rglob(".*")} <= {".run.lock", ".lock", ".truths.lock"}
 
 
 def test_two_runs_give_the_same_images_and_numbers(
@@ -204,6 +225,24 @@ def test_a_dry_run_makes_nothing_and_says_what_is_missing(
     said = capsys.readouterr().out
     assert "not yet known" in said
     assert not list(tmp_path.glob("greys/cells/*"))
+
+
+def test_a_dry_run_says_what_scoring_again_costs(
+    own: Path, copy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of images that are there, by what scoring such cells has taken."""
+    for file in copy.glob("greys/cells/*/cell.json"):
+        file.write_text(json.dumps(json.loads(file.read_text()) | {"scoring_seconds": 90.0}))
+    capsys.readouterr()
+    assert run_greys(own, copy, "scoring.lpips=[vgg]", dry_run=True) == 0
+    assert "about 6 min 0 s of one core" in capsys.readouterr().out
+
+
+def test_the_version_is_the_packages(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["--version"])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out.strip() == version("extrap-train")
 
 
 def test_compare_pairs_cells(own: Path, finished: Path, copy: Path) -> None:
