@@ -2,17 +2,16 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrap_train.data.images import to_eight_bits
+from extrap_train.geometry.epipolar import epipolar_distance, fundamental_matrix
 from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
 from extrap_train.geometry.warp import warp_references
+from extrap_train.matching.sift import Features, descriptor_distance, detect_sift, match_mutual
 from extrap_train.metrics import psnr
 from extrap_train.views import Camera
 
@@ -37,14 +36,6 @@ def neighbour_pairs(cameras: Camera) -> list[tuple[int, int]]:
     return sorted({(min(pair), max(pair)) for pair in nearest})
 
 
-@dataclass(frozen=True)
-class Matches:
-    """Pixels of two frames that look alike."""
-
-    first: Float[np.ndarray, "m 2"]
-    second: Float[np.ndarray, "m 2"]
-
-
 def tsed(images: Float[Tensor, "n 3 h w"], cameras: Camera) -> float:
     """Thresholded symmetric epipolar distance (Yu et al., 2023): the share of neighbouring pairs
     whose SIFT matches lie on each other's epipolar lines; NaN for fewer than two views.
@@ -52,73 +43,41 @@ def tsed(images: Float[Tensor, "n 3 h w"], cameras: Camera) -> float:
     A pair with fewer than 10 matches is inconsistent. Frames are resampled to 256 × 256 first, so
     that the 2 px mean what they meant there.
     """
-    pairs = neighbour_pairs(cameras)
-    frames = [_grey(image) for image in images]
-    enlarged = cameras.resized(TSED_FRAME, TSED_FRAME)
+    features = [
+        detect_sift(image, (TSED_FRAME, TSED_FRAME), edge_threshold=_EDGE_THRESHOLD)
+        for image in images
+    ]
     consistent = [
-        _is_consistent(_match(frames[i], frames[j]), enlarged[i], enlarged[j]) for i, j in pairs
+        _is_consistent(features[i], features[j], cameras[i], cameras[j])
+        for i, j in neighbour_pairs(cameras)
     ]
     return float(np.mean(consistent)) if consistent else math.nan
 
 
-def _grey(image: Float[Tensor, "3 h w"]) -> np.ndarray:
-    pixels = cv2.cvtColor(to_eight_bits(image.permute(1, 2, 0)), cv2.COLOR_RGB2GRAY)
-    return cv2.resize(pixels, (TSED_FRAME, TSED_FRAME), interpolation=cv2.INTER_CUBIC)
-
-
-def _match(first: np.ndarray, second: np.ndarray) -> Matches:
-    """SIFT with the ratio test, both ways."""
-    sift = cv2.SIFT.create(edgeThreshold=_EDGE_THRESHOLD)
-    (points_a, found_a), (points_b, found_b) = (
-        sift.detectAndCompute(f, None) for f in (first, second)
-    )
-    empty = np.zeros((0, 2))
-    if found_a is None or found_b is None or min(len(found_a), len(found_b)) < 2:
-        return Matches(empty, empty)
-    forth, back = _best(found_a, found_b), _best(found_b, found_a)
-    mutual = [(a, b) for a, b in forth.items() if back.get(b) == a]
-    if not mutual:
-        return Matches(empty, empty)
-    # OpenCV's pixel centres are whole numbers, ours are half ones.
-    return Matches(
-        np.array([points_a[a].pt for a, _ in mutual]) + 0.5,
-        np.array([points_b[b].pt for _, b in mutual]) + 0.5,
-    )
-
-
-def _best(query: np.ndarray, train: np.ndarray) -> dict[int, int]:
-    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(query, train, k=2)
-    return {
-        near.queryIdx: near.trainIdx for near, far in pairs if near.distance < _RATIO * far.distance
-    }
-
-
-def _is_consistent(matches: Matches, first: Camera, second: Camera) -> bool:
-    if len(matches.first) < TSED_MATCHES:
+def _is_consistent(first: Features, second: Features, camera: Camera, other: Camera) -> bool:
+    pairs = match_mutual(descriptor_distance(first, second), _RATIO)
+    if len(pairs) < TSED_MATCHES:
         return False
-    distance = epipolar_distance(matches.first, matches.second, first, second)
+    scale = np.array([TSED_FRAME / camera.width, TSED_FRAME / camera.height])
+    distance = symmetric_epipolar_distance(
+        first.pixels[pairs[:, 0]] * scale,
+        second.pixels[pairs[:, 1]] * scale,
+        fundamental_matrix(
+            camera.resized(TSED_FRAME, TSED_FRAME), other.resized(TSED_FRAME, TSED_FRAME)
+        ),
+    )
     return float(np.median(distance)) < TSED_PIXELS
 
 
-def epipolar_distance(
-    first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"], one: Camera, two: Camera
+def symmetric_epipolar_distance(
+    first: Float[np.ndarray, "m 2"],
+    second: Float[np.ndarray, "m 2"],
+    fundamental: Float[np.ndarray, "3 3"],
 ) -> Float[np.ndarray, " m"]:
-    """Mean of each match's two distances, in pixels, to the other's epipolar line (the "symmetric
-    epipolar distance"), from the given poses.
-    """
-    relative = (two.world_to_cam @ one.cam_to_world).double().numpy(force=True)
-    rotation, t = relative[:3, :3], relative[:3, 3]
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-    inverse_one, inverse_two = (
-        np.linalg.inv(camera.intrinsics.double().numpy(force=True)) for camera in (one, two)
-    )
-    fundamental = inverse_two.T @ cross @ rotation @ inverse_one
-    a, b = (np.concatenate([points, np.ones((len(points), 1))], 1) for points in (first, second))
-    line_two, line_one = a @ fundamental.T, b @ fundamental
-    residual = np.abs((b * line_two).sum(1))
+    """Mean of each match's two distances, in pixels, to the other's epipolar line."""
     return 0.5 * (
-        residual / np.linalg.norm(line_two[:, :2], axis=1)
-        + residual / np.linalg.norm(line_one[:, :2], axis=1)
+        epipolar_distance(first, second, fundamental)
+        + epipolar_distance(second, first, fundamental.T)
     )
 
 

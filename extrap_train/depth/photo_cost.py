@@ -1,4 +1,4 @@
-"""How alike views look at hypothetical depths: the matching cost of plane-sweep stereo."""
+"""Matching cost of plane-sweep stereo: NCC of two views at hypothetical depths."""
 
 from dataclasses import dataclass
 
@@ -8,12 +8,11 @@ from torch import Tensor
 from torch.nn import functional
 
 from extrap_train.geometry.cameras import pixel_grid
+from extrap_train.geometry.ncc import COLOUR_NOISE, box_mean
 from extrap_train.views import Camera, View
 
 WINDOW = 5
 """Side of the window that is compared, in pixels."""
-NOISE_VARIANCE = 5e-6
-"""Variance of a colour channel (0.6/255 squared) that counts as noise, not as texture."""
 CHUNK_ELEMENTS = 4_000_000
 """Most colour samples that are held at a time."""
 
@@ -74,7 +73,7 @@ class PhotoCost:
         self.neighbours = [
             (projection_between(view.camera, other.camera), other.image) for other in neighbours
         ]
-        self.mean = _box(self.image[None])
+        self.mean = box_mean(self.image[None], WINDOW)
         self.variance = _variance(self.image[None], self.mean)
 
     def __call__(self, inverse_depth: Float[Tensor, "d h w"]) -> Float[Tensor, "d h w"]:
@@ -104,20 +103,13 @@ class PhotoCost:
             padding_mode="border",
             align_corners=False,
         )
-        mean = _box(warped)
+        mean = box_mean(warped, WINDOW)
         variance = _variance(warped, mean)
-        covariance = (_box(warped * self.image) - mean * self.mean).sum(1)
-        noise = NOISE_VARIANCE * len(image)
+        covariance = (box_mean(warped * self.image, WINDOW) - mean * self.mean).sum(1)
+        noise = COLOUR_NOISE * len(image)
         correlation = covariance * ((variance + noise) * (self.variance + noise)).rsqrt()
         return torch.where(inside, (1 - correlation.clamp(-1, 1)) / 2, torch.inf)
 
 
 def _variance(image: Float[Tensor, "d c h w"], mean: Tensor) -> Float[Tensor, "d h w"]:
-    return (_box(image.square()) - mean.square()).clamp_min(0).sum(1)
-
-
-def _box(image: Float[Tensor, "d c h w"]) -> Float[Tensor, "d c h w"]:
-    """Mean over a window; at the border over its part inside."""
-    half = WINDOW // 2
-    rows = functional.avg_pool2d(image, (WINDOW, 1), 1, (half, 0), count_include_pad=False)
-    return functional.avg_pool2d(rows, (1, WINDOW), 1, (0, half), count_include_pad=False)
+    return (box_mean(image.square(), WINDOW) - mean.square()).clamp_min(0).sum(1)

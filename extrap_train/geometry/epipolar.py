@@ -1,5 +1,8 @@
-"""Epipolar lines: where wrong depths move a point, and where only wrong poses or chance do."""
+"""Epipolar geometry of two posed pictures: where wrong depths move a point, and where only wrong
+poses or chance do.
+"""
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -7,14 +10,52 @@ from torch import Tensor
 from extrap_train.views import Camera
 
 
+def fundamental_matrix(first: Camera, second: Camera) -> Float[np.ndarray, "3 3"]:
+    """F with p₂ᵀ F p₁ = 0 for homogeneous pixels of one point, from the known cameras.
+
+    F = K₂⁻ᵀ [t]ₓ R K₁⁻¹ with the motion (R, t) from the first camera to the second; double
+    precision. Zero where both cameras have one centre.
+    """
+    motion = (second.world_to_cam.double() @ first.cam_to_world.double()).numpy(force=True)
+    x, y, z = motion[:3, 3]
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    inverse_first, inverse_second = (
+        np.linalg.inv(camera.intrinsics.double().numpy(force=True)) for camera in (first, second)
+    )
+    return inverse_second.T @ cross @ motion[:3, :3] @ inverse_first
+
+
+def epipolar_lines(
+    pixels: Float[np.ndarray, "n 2"], fundamental: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Line of each pixel in the other picture; its product with a homogeneous pixel is the signed
+    distance in pixels."""
+    lines = homogeneous(pixels) @ fundamental.T
+    return lines / np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-30)
+
+
+def epipolar_distance(
+    first: Float[np.ndarray, "n 2"],
+    second: Float[np.ndarray, "n 2"],
+    fundamental: Float[np.ndarray, "3 3"],
+) -> Float[np.ndarray, " n"]:
+    """Pixels between each second point and the epipolar line of the first."""
+    return np.abs((epipolar_lines(first, fundamental) * homogeneous(second)).sum(1))
+
+
+def homogeneous(pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+    """(u, v, 1)."""
+    return np.concatenate([pixels, np.ones((len(pixels), 1))], 1)
+
+
 def epipolar_directions(
     pixels: Float[Tensor, "n 2"], reference: Camera, query: Camera
 ) -> Float[Tensor, "n 2"]:
-    """Unit vectors along the query's epipolar lines through its `pixels`, signs left open.
+    """Unit vectors along the query's epipolar lines through its `pixels`, with either sign.
 
     All these lines meet in the epipole, the picture e of the reference's centre: the line through p
-    runs along e₁₂ − e₃·p, which holds for an epipole at infinity (e₃ = 0), too. Zero at the epipole
-    itself and where both cameras have one centre.
+    runs along e₁₂ − e₃·p, also for an epipole at infinity (e₃ = 0). Zero at the epipole itself and
+    where both cameras have one centre.
     """
     center = reference.center
     seen = query.world_to_cam[:3, :3] @ center + query.world_to_cam[:3, 3]

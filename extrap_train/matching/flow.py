@@ -14,8 +14,8 @@ from torch.nn import functional
 from extrap_train.config import FlowMatcherConfig
 from extrap_train.geometry.cameras import pixel_grid
 from extrap_train.geometry.fill import fill_holes
+from extrap_train.geometry.ncc import windowed_correlation
 from extrap_train.matching import DenseFlow, Matches
-from extrap_train.matching.likeness import windowed_correlation
 from extrap_train.matching.pictures import grey, resized
 
 LARGEST_ENLARGEMENT = 2.0
@@ -30,8 +30,8 @@ LEAST_SIDE = 16
 class FlowMatcher:
     """Coarse to fine, robust to exposure, for displacements of up to about a tenth of the picture.
 
-    Confidence is how alike the windows around both ends are (zero-mean normalised correlation, 0
-    without texture) times exp(−e²/2), e the forward-backward error in pixels.
+    Confidence is the normalised cross-correlation of the windows around both ends (0 without
+    texture) times exp(−e²/2), with e the forward-backward error in pixels.
     """
 
     config: FlowMatcherConfig
@@ -58,9 +58,9 @@ class FlowMatcher:
         forward, backward = self._both_ways(grey(filled), grey(there))
         found, inside = _sample(torch.cat([there, backward]), forward)
         error = (forward + found[3:]).norm(dim=0)
-        likeness = windowed_correlation(filled, found[:3], known)
+        correlation = windowed_correlation(filled, found[:3], known)
         sure = inside & (known > 0) & (error < LARGEST_ERROR)
-        confidence = torch.where(sure, likeness * (-error.square() / 2).exp(), 0)
+        confidence = torch.where(sure, correlation * (-error.square() / 2).exp(), 0)
         return DenseFlow(forward.permute(1, 2, 0).to(first), confidence.to(first))
 
     def _both_ways(

@@ -13,10 +13,10 @@ from torch import Tensor
 from extrap_train.config import ConfidenceConfig
 from extrap_train.depth import DepthSource
 from extrap_train.geometry.cameras import unproject_to_world
+from extrap_train.geometry.ncc import ncc_consistent
 from extrap_train.reconstruction.agreement import Sight, look_up
 from extrap_train.reconstruction.continuation import continued_depth
 from extrap_train.reconstruction.global_map import MOST_COMPARED, GlobalMap
-from extrap_train.reconstruction.likeness import alike
 from extrap_train.reconstruction.measurement import (
     Measured,
     confirmed,
@@ -93,7 +93,7 @@ def _agreement(picture: View, prior: Prior, measured: Measured, tolerance: float
     """Share of testable pixels that agree, by picture and by depth: the lesser one; 0 without any
     testable pixel.
     """
-    by_picture = alike(picture.image, prior.image, prior.mask)
+    by_picture = ncc_consistent(picture.image, prior.image, prior.mask)
     by_depth = confirmed(measured, prior, tolerance)
     shares = [
         float(agrees.sum() / testable.sum())

@@ -3,12 +3,13 @@
 from collections.abc import Sequence
 from itertools import pairwise
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
 
 from extrap_train.errors import InputError
+from extrap_train.geometry.epipolar import epipolar_distance, fundamental_matrix
+from extrap_train.matching.sift import descriptor_distance, detect_sift, match_mutual
 from extrap_train.views import Camera, View
 
 SIDE = 640
@@ -34,13 +35,15 @@ def check_poses(views: Sequence[View]) -> None:
     given: list[float] = []
     others: dict[str, list[float]] = {}
     small = [_small(view) for view in views]
-    for one, other in pairwise(small):
-        matches = _matches(one, other)
-        if len(matches) < LEAST_MATCHES:
+    described = [(view.camera, detect_sift(view.image)) for view in small]
+    for (one, features), (other, other_features) in pairwise(described):
+        pairs = match_mutual(descriptor_distance(features, other_features), RATIO)
+        if len(pairs) < LEAST_MATCHES:
             continue
-        given.append(_distance(matches, one.camera, other.camera))
-        for name, cameras in _alternatives(one.camera, other.camera).items():
-            others.setdefault(name, []).append(_distance(matches, *cameras))
+        points = features.pixels[pairs[:, 0]], other_features.pixels[pairs[:, 1]]
+        given.append(_distance(*points, one, other))
+        for name, cameras in _alternatives(one, other).items():
+            others.setdefault(name, []).append(_distance(*points, *cameras))
     if not given or np.median(given) < FAR_PIXELS:
         return
     best = min(others, key=lambda name: float(np.median(others[name])))
@@ -75,35 +78,8 @@ def _inverted(camera: Camera) -> Camera:
     return Camera(camera.cam_to_world, camera.intrinsics, camera.height, camera.width)
 
 
-def _matches(one: View, other: View) -> Float[np.ndarray, "n 4"]:
-    """(u, v) in the first and in the second picture, by SIFT, mutual and distinct."""
-    finder = cv2.SIFT.create()
-    grey = [
-        cv2.cvtColor(
-            (view.image * 255).byte().permute(1, 2, 0).contiguous().numpy(), cv2.COLOR_RGB2GRAY
-        )
-        for view in (one, other)
-    ]
-    (points, first), (other_points, second) = (finder.detectAndCompute(g, None) for g in grey)
-    if first is None or second is None or min(len(first), len(second)) < 2:
-        return np.zeros((0, 4))
-    pairs = cv2.BFMatcher().knnMatch(first, second, k=2)
-    kept = [m for m, n in (p for p in pairs if len(p) == 2) if m.distance < RATIO * n.distance]
-    return np.array([[*points[m.queryIdx].pt, *other_points[m.trainIdx].pt] for m in kept]).reshape(
-        -1, 4
-    )
-
-
-def _distance(matches: Float[np.ndarray, "n 4"], one: Camera, other: Camera) -> float:
-    """Median distance of the second point from the first one's epipolar line, in pixels."""
-    relative = (other.world_to_cam @ one.cam_to_world).double().numpy()
-    x, y, z = relative[:3, 3] / max(float(np.linalg.norm(relative[:3, 3])), 1e-12)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    k, k_other = (camera.intrinsics.double().numpy() for camera in (one, other))
-    fundamental = np.linalg.inv(k_other).T @ cross @ relative[:3, :3] @ np.linalg.inv(k)
-    # OpenCV counts pixel centres from 0, we from +0.5.
-    first = np.c_[matches[:, :2] + 0.5, np.ones(len(matches))]
-    second = np.c_[matches[:, 2:] + 0.5, np.ones(len(matches))]
-    lines = first @ fundamental.T
-    length = np.linalg.norm(lines[:, :2], axis=1)
-    return float(np.median(np.abs((lines * second).sum(1)) / np.maximum(length, 1e-12)))
+def _distance(
+    first: Float[np.ndarray, "n 2"], second: Float[np.ndarray, "n 2"], one: Camera, other: Camera
+) -> float:
+    """Median distance of the second points from the first ones' epipolar lines, in pixels."""
+    return float(np.median(epipolar_distance(first, second, fundamental_matrix(one, other))))

@@ -1,7 +1,7 @@
 import numpy as np
 import torch
 
-from extrap_train.matching.likeness import WINDOW, windowed_correlation
+from extrap_train.geometry.ncc import WINDOW, windowed_correlation
 
 
 def test_correlation_is_numpys_in_every_window():
