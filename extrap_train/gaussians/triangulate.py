@@ -14,8 +14,23 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from extrap_train.gaussians.points import Points
-from extrap_train.gaussians.sift import Features, detect, match, projection_matrices
-from extrap_train.views import View
+from extrap_train.geometry.epipolar import epipolar_lines, fundamental_matrix, homogeneous
+from extrap_train.matching.sift import (
+    Features,
+    descriptor_distance,
+    detect_sift,
+    match_mutual,
+    root_sift,
+)
+from extrap_train.views import Camera, View
+
+LEAST_SIDE = 512
+"""Smaller photographs are enlarged to this longer side first: SIFT needs room for its octaves."""
+CONTRAST_THRESHOLD = 0.02
+RATIO = 0.8
+"""Of Lowe's test."""
+EPIPOLAR_SHARE = 0.006
+"""Farthest a match may lie from its epipolar line, as a share of the longer side."""
 
 LARGEST_ERROR_SHARE = 0.006
 """Reprojection error from which a point is dropped, as a share of the image's longer side."""
@@ -28,11 +43,30 @@ def triangulated_points(views: Sequence[View]) -> Points:
 
     No point at all is a possible answer: views that are far apart share no SIFT features.
     """
-    features = [detect(view) for view in views]
+    features = [_detect(view) for view in views]
     found = [_point(track, features, views) for track in _tracks(features, views)]
     rows = np.array([row for row in found if row is not None]).reshape(-1, 6)
     table = torch.from_numpy(rows).float()
     return Points(table[:, :3], table[:, 3:], torch.ones(len(table)))
+
+
+def _detect(view: View) -> Features:
+    """RootSIFT features at a size that leaves SIFT its octaves."""
+    height, width = view.image.shape[1:]
+    scale = max(1.0, LEAST_SIDE / max(height, width))
+    size = round(height * scale), round(width * scale)
+    return root_sift(detect_sift(view.image, size, contrast_threshold=CONTRAST_THRESHOLD))
+
+
+def _match(
+    first: Features, second: Features, cameras: tuple[Camera, Camera]
+) -> Int[np.ndarray, "m 2"]:
+    """Mutual matches among the features on each other's epipolar lines."""
+    lines = epipolar_lines(first.pixels, fundamental_matrix(*cameras))
+    off_line = np.abs(lines @ homogeneous(second.pixels).T)
+    limit = EPIPOLAR_SHARE * max(cameras[1].height, cameras[1].width)
+    distance = descriptor_distance(first, second)
+    return match_mutual(np.where(off_line > limit, np.inf, distance), RATIO)
 
 
 def _tracks(features: Sequence[Features], views: Sequence[View]) -> list[Int[np.ndarray, "k 2"]]:
@@ -40,7 +74,7 @@ def _tracks(features: Sequence[Features], views: Sequence[View]) -> list[Int[np.
     starts = np.cumsum([0, *(len(each.pixels) for each in features)])
     edges = [np.zeros((0, 2), np.int64)]
     for i, j in combinations(range(len(views)), 2):
-        pairs = match(features[i], features[j], (views[i].camera, views[j].camera))
+        pairs = _match(features[i], features[j], (views[i].camera, views[j].camera))
         edges.append(pairs + starts[[i, j]])
     first, second = np.concatenate(edges).T
     size = starts[-1]
@@ -121,3 +155,9 @@ def _color(pixels: Float[np.ndarray, "k 2"], views: Sequence[View]) -> Float[np.
         column = min(max(int(u), 0), view.camera.width - 1)
         colors.append(view.image[:, row, column].double().numpy())
     return np.mean(colors, axis=0)
+
+
+def projection_matrices(cameras: Sequence[Camera]) -> Float[np.ndarray, "k 3 4"]:
+    """`K [R | t]` of every camera, in float64."""
+    rows = [c.intrinsics.double() @ c.world_to_cam[:3].double() for c in cameras]
+    return torch.stack(rows).numpy()

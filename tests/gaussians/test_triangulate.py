@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from extrap_train.gaussians.sift import epipolar_distance, projection_matrices
-from extrap_train.gaussians.triangulate import triangulate, triangulated_points
+from extrap_train.gaussians.triangulate import (
+    projection_matrices,
+    triangulate,
+    triangulated_points,
+)
 from extrap_train.geometry.cameras import project
 from extrap_train.views import View
 from tests.scenes import orbit_camera as analytic_camera
@@ -65,12 +68,3 @@ def test_noise_costs_no_more_than_any_small_step_would_gain():
     pixels = exact[:, :2] / exact[:, 2:] + rng.normal(0, 0.5, (3, 2))
     found = triangulate(pixels, projections)
     assert all(error(found) <= error(found + 1e-3 * rng.normal(size=3)) for _ in range(50))
-
-
-def test_epipolar_distance_of_a_true_match_is_zero():
-    first, second = analytic_camera(0), analytic_camera(35)
-    points = torch.tensor([[0.1, 0.2, 0.3], [-0.3, 0.1, 0.0]])
-    a, b = (project(points, camera)[0].double().numpy() for camera in (first, second))
-    distance = epipolar_distance(a, b, (first, second))
-    np.testing.assert_allclose(np.diag(distance), 0, atol=1e-3)
-    assert distance[0, 1] > 1

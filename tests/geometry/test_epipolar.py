@@ -3,17 +3,15 @@ import torch
 from scenes import orbit_camera
 
 from extrap_train.geometry.cameras import project, transform
-from extrap_train.geometry.epipolar import epipolar_directions, steps_across
+from extrap_train.geometry.epipolar import (
+    epipolar_directions,
+    epipolar_distance,
+    epipolar_lines,
+    fundamental_matrix,
+    homogeneous,
+    steps_across,
+)
 from extrap_train.views import Camera
-
-
-def fundamental_matrix(reference: Camera, query: Camera) -> np.ndarray:
-    """K₂⁻ᵀ [t]× R K₁⁻¹ of first-to-second R, t."""
-    motion = (query.world_to_cam @ reference.cam_to_world).double().numpy()
-    x, y, z = motion[:3, 3]
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    inverses = [np.linalg.inv(c.intrinsics.double().numpy()) for c in (reference, query)]
-    return inverses[1].T @ cross @ motion[:3, :3] @ inverses[0]
 
 
 def points_at(camera: Camera, depth: torch.Tensor, count: int = 200) -> torch.Tensor:
@@ -56,3 +54,15 @@ def test_cameras_side_by_side_have_rows_for_lines_and_one_camera_has_none():
     across = steps_across(pixels, steps, reference, query)
     assert torch.allclose(across, torch.tensor([2.0, 3.0]), atol=1e-4)
     assert not epipolar_directions(pixels, query, query).isnan().any()
+
+
+def test_distances_from_epipolar_lines_are_those_of_exact_projections():
+    first, second = orbit_camera(0, size=128), orbit_camera(35, size=128)
+    points = torch.tensor([[0.1, 0.2, 0.3], [-0.3, 0.1, 0.0]])
+    a, b = (project(points, camera)[0].double().numpy() for camera in (first, second))
+    fundamental = fundamental_matrix(first, second)
+    np.testing.assert_allclose(epipolar_distance(a, b, fundamental), 0, atol=1e-3)
+    lines = epipolar_lines(a, fundamental)
+    assert abs(lines[0] @ homogeneous(b)[1]) > 1
+    normals = lines[:, :2]
+    np.testing.assert_allclose(epipolar_distance(a, b + 3 * normals, fundamental), 3, atol=1e-3)
