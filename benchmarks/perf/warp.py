@@ -12,8 +12,8 @@ from torch import Tensor
 from benchmarks.perf.timing import Row, compare
 from benchmarks.perf.warp_reference import splat_reference
 from extrap_train.geometry.cameras import unproject_to_world
-from extrap_train.geometry.splat import splat
 from extrap_train.geometry.visibility import Ball, Visibility, trace_torch, trace_visibility
+from extrap_train.geometry.warp import splat_points
 from extrap_train.views import Camera, stack_cameras
 
 CHANNELS = 7
@@ -38,7 +38,7 @@ def _compare_splats(size: int, device: torch.device) -> Row:
     return compare(
         f"{len(ANGLES_DEG)} references, {size}x{size}, {CHANNELS} channels",
         device,
-        lambda: splat(points, values, query).means,
+        lambda: splat_points(points, values, query).means,
         lambda: splat_reference(points, values, query).permute(2, 0, 1),
     )
 

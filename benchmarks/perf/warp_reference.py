@@ -4,14 +4,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrap_train.geometry.splat_torch import DEPTH_SHARPNESS
+from extrap_train.geometry.warp.splat import DEPTH_SHARPNESS
 from extrap_train.views import Camera
 
 
 def splat_reference(
     world_points: Float[Tensor, "n 3"], values: Float[Tensor, "n c"], camera: Camera
 ) -> Float[Tensor, "h w c1"]:
-    """Mean values and, as the last channel, the summed weight, as `geometry.splat` defines them."""
+    """Mean values and, as the last channel, the summed weight (see `geometry.warp.splat`)."""
     x, y, z = world_points.unbind(-1)
     rows = camera.intrinsics @ camera.world_to_cam[:3]
     u, v, depth = (row[0] * x + row[1] * y + row[2] * z + row[3] for row in rows)

@@ -8,6 +8,7 @@ are 2 / (g − 3) apart, so that a field bends about that fast and no faster.
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import functional
 
 STIFFNESS = 1e-5
 """Weight of the field's second differences against one per match: decides only where none are."""
@@ -38,6 +39,23 @@ def flow_at(
     """The field at normalised (u, v)."""
     across, down = (bspline_basis(p, control.shape[-1]) for p in positions.unbind(-1))
     return torch.einsum("ni,nj,cij->nc", down.to(control), across.to(control), control)
+
+
+def flow_at_pixels(
+    control: Float[Tensor, "2 g g"], pixels: Float[Tensor, "2 n"], height: int, width: int
+) -> Float[Tensor, "2 n"]:
+    """The field, in pixels, at (u, v) of an image.
+
+    Interpolated between pixel centres: a smooth field allows it, and its splines at every point
+    would cost much more.
+    """
+    field = dense_flow(control, height, width)
+    size = pixels.new_tensor([width, height])
+    at = (pixels.mT / size * 2 - 1)[None, None]
+    found = functional.grid_sample(
+        field[None].to(pixels), at, padding_mode="border", align_corners=False
+    )
+    return found[0, :, 0] * (size / 2)[:, None]
 
 
 def bspline_basis(positions: Float[Tensor, " n"], count: int) -> Float[Tensor, "n g"]:

@@ -20,9 +20,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from extrap_train.geometry.cameras import pixel_grid
-from extrap_train.geometry.splat import needs_torch
 from extrap_train.geometry.viewpoints import camera_centers, scene_center
 from extrap_train.geometry.visibility_numba import trace_numba
+from extrap_train.geometry.warp import needs_torch
 from extrap_train.views import Camera
 
 SAMPLES = 64

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from extrap_train.geometry.cameras import unproject_to_world
-from extrap_train.geometry.normals import normals_from_depth
+from extrap_train.geometry.warp.surface import normals_from_depth
 from extrap_train.reconstruction.agreement import Sight, look_up
 from extrap_train.reconstruction.global_map import MOST_COMPARED, GlobalMap, MapView
 from extrap_train.views import combine

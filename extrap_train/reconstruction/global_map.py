@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from extrap_train.geometry.cameras import unproject_to_world
-from extrap_train.geometry.normals import surface_from_depth
 from extrap_train.geometry.viewpoints import references_by_nearness
+from extrap_train.geometry.warp.surface import surface_from_depth
 from extrap_train.reconstruction.agreement import Sight, look_up
 from extrap_train.views import Camera, View, stack_cameras
 

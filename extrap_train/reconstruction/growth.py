@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrap_train.geometry.splat import splat
 from extrap_train.geometry.viewpoints import camera_centers, scene_center
+from extrap_train.geometry.warp import splat_points
 from extrap_train.pictures import contact_sheet, film
 from extrap_train.reconstruction.cloud import PointCloud
 from extrap_train.reconstruction.global_map import GIVEN, GlobalMap
@@ -119,6 +119,6 @@ def _drawn(cloud: PointCloud, cameras: Camera) -> Float[Tensor, "n 3 h w"]:
     """The cloud as each camera sees it, on white."""
     pictures = []
     for index in range(len(cameras.world_to_cam)):
-        drawn = splat(cloud.points, cloud.colors, cameras[index])
+        drawn = splat_points(cloud.points, cloud.colors, cameras[index])
         pictures.append(torch.where(drawn.weight > 0, drawn.values, 1.0))
     return torch.stack(pictures)

@@ -8,13 +8,13 @@ from benchmarks.__main__ import main
 from benchmarks.perf.timing import Row, compare, write_rows
 from benchmarks.perf.warp import bumpy_views, orbit_camera
 from benchmarks.perf.warp_reference import splat_reference
-from extrap_train.geometry.splat import splat
+from extrap_train.geometry.warp import splat_points
 
 
 def test_reference_is_equal():
     points, values = bumpy_views(48)
     query = orbit_camera(15.0, 48)
-    drawn = splat(points, values, query)
+    drawn = splat_points(points, values, query)
     reference = splat_reference(points, values, query).permute(2, 0, 1)
     assert torch.allclose(drawn.values, reference[:-1], atol=1e-4)
     assert torch.allclose(drawn.weight, reference[-1], atol=1e-4)

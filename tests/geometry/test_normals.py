@@ -5,7 +5,7 @@ import scenes
 import torch
 
 from extrap_train.geometry.cameras import unproject
-from extrap_train.geometry.normals import normals_from_depth
+from extrap_train.geometry.warp.surface import normals_from_depth
 
 
 def test_sphere_normals_point_away_from_its_centre():

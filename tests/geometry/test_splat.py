@@ -5,8 +5,8 @@ import pytest
 import scenes
 import torch
 
-from extrap_train.geometry.splat import splat
-from extrap_train.geometry.splat_torch import DEPTH_SHARPNESS
+from extrap_train.geometry.warp import splat_points
+from extrap_train.geometry.warp.splat import DEPTH_SHARPNESS
 from extrap_train.views import Camera
 
 
@@ -23,7 +23,7 @@ def cloud(count=4000, channels=7):
 def test_two_points_blend_by_kernel_and_depth():
     z = torch.tensor([2.0, 2.01])
     points = torch.stack([torch.tensor([3.5, 3.75]) * z, 3.5 * z, z], -1)
-    drawn = splat(points, torch.tensor([[1.0], [0.0]]), pinhole())
+    drawn = splat_points(points, torch.tensor([[1.0], [0.0]]), pinhole())
     weight = 0.75 * torch.exp(torch.tensor(-DEPTH_SHARPNESS * 0.005))
     assert torch.allclose(drawn.weight[3, 3], 1 + weight, atol=1e-4)
     assert torch.allclose(drawn.values[0, 3, 3], 1 / (1 + weight), atol=1e-4)
@@ -32,7 +32,7 @@ def test_two_points_blend_by_kernel_and_depth():
 
 def test_nearer_point_hides_the_farther():
     points = torch.tensor([[7.0, 7.0, 2.0], [14.0, 14.0, 4.0]])
-    drawn = splat(points, torch.tensor([[1.0], [9.0]]), pinhole())
+    drawn = splat_points(points, torch.tensor([[1.0], [9.0]]), pinhole())
     assert drawn.values[0, 3, 3] == 1.0
 
 
@@ -40,8 +40,8 @@ def test_nearer_point_hides_the_farther():
 def test_torch_and_numba_agree(channels):
     points, values = cloud(channels=channels)
     camera = scenes.orbit_camera(20, size=48)
-    compiled = splat(points, values, camera)
-    vectorised = splat(points, values.clone().requires_grad_(), camera)
+    compiled = splat_points(points, values, camera)
+    vectorised = splat_points(points, values.clone().requires_grad_(), camera)
     assert torch.allclose(compiled.values, vectorised.values, atol=1e-4)
     assert torch.allclose(compiled.weight, vectorised.weight, atol=1e-4)
 
@@ -58,7 +58,7 @@ def test_same_bits_on_one_and_two_threads(size):
     try:
         for threads in (1, 2, 2):
             numba.set_num_threads(threads)
-            results.append(splat(points, values, camera))
+            results.append(splat_points(points, values, camera))
     finally:
         numba.set_num_threads(before)
     for result in results[1:]:
@@ -67,5 +67,7 @@ def test_same_bits_on_one_and_two_threads(size):
 
 
 def test_points_behind_the_camera_are_not_drawn():
-    drawn = splat(torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 0.0]]), torch.ones(2, 3), pinhole())
+    drawn = splat_points(
+        torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 0.0]]), torch.ones(2, 3), pinhole()
+    )
     assert not drawn.weight.any()

@@ -1,4 +1,12 @@
-"""Softmax splatting in torch: on any device, differentiable in positions, depth and values."""
+"""Softmax splatting of points by depth (paper Eq. 1), in torch: on any device, differentiable in
+positions, depth and values.
+
+Per pixel, `Σ b·e·v / Σ b·e` with the bilinear kernel b and `e = exp(−β |z/z_nearest − 1|)`, where
+z_nearest is the least depth of the points that reach the pixel's centre: it is the maximum that is
+subtracted and the unit that depth is measured in, so nothing overflows and nothing depends on the
+scene's scale. A point that touches the kernel but does not reach the centre blends in without
+making the silhouette grow; a pixel that no point reaches stays empty.
+"""
 
 from dataclasses import dataclass, replace
 

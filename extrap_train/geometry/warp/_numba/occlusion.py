@@ -1,24 +1,24 @@
-"""`warp_walls` on the CPU: the same walls, one after the other, in compiled loops."""
+"""`occlusion` on the CPU: the same walls, one after the other, in compiled loops."""
 
 import math
 
 import numpy as np
 
-from extrap_train.geometry import warp_walls
 from extrap_train.geometry.compiled import compiled
-from extrap_train.geometry.warp_projection import LEAST_DEPTH_RATIO
+from extrap_train.geometry.warp import occlusion
+from extrap_train.geometry.warp.projection import LEAST_DEPTH_RATIO
 
 _HALF, _ONE, _TWO = np.float32(0.5), np.float32(1), np.float32(2)
 _LEAST_RATIO = np.float32(LEAST_DEPTH_RATIO)
-_DEPTH_PER_WIDTH = np.float32(warp_walls.DEPTH_PER_WIDTH)
-_SPACING = np.float32(warp_walls.SPACING)
-_MOST_POINTS = np.float32(warp_walls.MOST_POINTS)
-_ACROSS = warp_walls.ACROSS
+_DEPTH_PER_WIDTH = np.float32(occlusion.DEPTH_PER_WIDTH)
+_SPACING = np.float32(occlusion.SPACING)
+_MOST_POINTS = np.float32(occlusion.MOST_POINTS)
+_ACROSS = occlusion.ACROSS
 
 
 @compiled()
 def project(m: np.ndarray, u: float, v: float, inverse: float) -> tuple[float, float, float]:
-    """`warp_projection.project_pixels` of one pixel."""
+    """`projection.project_pixels` of one pixel."""
     x = m[0, 0] * u + m[0, 1] * v + m[0, 2] + m[0, 3] * inverse
     y = m[1, 0] * u + m[1, 1] * v + m[1, 2] + m[1, 3] * inverse
     ratio = m[2, 0] * u + m[2, 1] * v + m[2, 2] + m[2, 3] * inverse
@@ -27,7 +27,7 @@ def project(m: np.ndarray, u: float, v: float, inverse: float) -> tuple[float, f
 
 
 @compiled()
-def draw_walls(
+def draw_occlusion(
     inverse: np.ndarray,
     links: np.ndarray,
     intrinsics: np.ndarray,
@@ -35,7 +35,7 @@ def draw_walls(
     unseen: np.ndarray,
 ) -> None:
     """Lower one reference's depth buffer `unseen` to the walls behind its occluding edges; links
-    as in `normals_numba`."""
+    as in `_numba.surface`."""
     height, width = inverse.shape
     for y in range(height):
         for x in range(width):

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from extrap_train.geometry.compiled import compiled
-from extrap_train.geometry.splat_torch import DEPTH_SHARPNESS, OUTSIDE
+from extrap_train.geometry.warp.splat import DEPTH_SHARPNESS, OUTSIDE
 
 _HALF, _ONE, _INFINITY = (np.float32(x) for x in (0.5, 1, np.inf))
 _OUTSIDE = np.float32(OUTSIDE)
@@ -44,7 +44,7 @@ def splat_numba(
     """Weighted means of the values, and the summed weight as the last channel.
 
     Points are u, v and depth, with their reach along u and v (or that of all of them), as in
-    `splat_torch.ScreenPoints`; those of an image are the ones from the first up to the second
+    `splat.ScreenPoints`; those of an image are the ones from the first up to the second
     index of each of its spans.
     """
     images = len(spans)

@@ -1,22 +1,17 @@
-"""What a reference cannot know: the space behind the edges of what it sees.
+"""Occlusion by what a reference cannot know: the space behind the edges of what it sees.
 
-Seen from the side, a solid object has a flank that the reference never saw, and what lies behind
-it shines through. So a wall is drawn from each occluding edge backwards along the reference's
-ray. How deep the object is nobody knows: `DEPTH_PER_WIDTH` is what an apple and a box both get
-along with.
+Seen from the side, a solid object has a flank that the reference never saw, and without it what
+lies behind shines through. So a wall is drawn from each occluding edge backwards along the
+reference's ray. The object's depth is unknown: `DEPTH_PER_WIDTH` suits an apple and a box.
 """
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from extrap_train.geometry.normals import Surface
-from extrap_train.geometry.splat_torch import ScreenPoints
-from extrap_train.geometry.warp_projection import (
-    LEAST_DEPTH_RATIO,
-    project_pixels,
-    subdivide,
-)
+from extrap_train.geometry.warp.projection import LEAST_DEPTH_RATIO, project_pixels, subdivide
+from extrap_train.geometry.warp.splat import ScreenPoints
+from extrap_train.geometry.warp.surface import Surface
 from extrap_train.views import Camera
 
 DEPTH_PER_WIDTH = 0.35
@@ -33,7 +28,7 @@ ACROSS = 3
 """Points of a wall along the edge, per reference pixel."""
 
 
-def hidden_by_unseen(
+def is_occluded(
     surface: Surface,
     matrix: Float[Tensor, "b k 3 4"],
     cameras: Camera,
@@ -44,20 +39,20 @@ def hidden_by_unseen(
     references."""
     column = points.u.long().clamp(0, query.width - 1)
     row = points.v.long().clamp(0, query.height - 1)
-    limit = depth_of_unseen(surface, matrix, cameras, query).flatten(0, 1)[
+    limit = occlusion_depth(surface, matrix, cameras, query).flatten(0, 1)[
         points.image, row, column
     ]
     return points.depth > limit * (1 + TOLERANCE)
 
 
-def depth_of_unseen(
+def occlusion_depth(
     surface: Surface, matrix: Float[Tensor, "b k 3 4"], cameras: Camera, query: Camera
 ) -> Float[Tensor, "b k h2 w2"]:
     """Per reference, the query depth where unseen space begins; infinite where the reference
     knows no better."""
     b, k = matrix.shape[:2]
     empty = torch.full((b * k * query.height * query.width,), torch.inf, device=matrix.device)
-    image, side, v, u, start, stop = _walls(surface, cameras)
+    image, side, v, u, start, stop = _occlusion_volumes(surface, cameras)
     walls = matrix.detach().reshape(-1, 3, 4)[image]
     length = _length(walls, u, v, start, stop)
     along = (length / SPACING).nan_to_num(0).clamp(1, MOST_POINTS).ceil().long()
@@ -79,7 +74,7 @@ def depth_of_unseen(
     return filled.reshape(b, k, query.height, query.width)
 
 
-def _walls(surface: Surface, cameras: Camera) -> tuple[Tensor, ...]:
+def _occlusion_volumes(surface: Surface, cameras: Camera) -> tuple[Tensor, ...]:
     """Image, side, v, u of each occluding edge, and the inverse depths at which its wall starts
     and stops."""
     h, w = surface.inverse_depth.shape[-2:]

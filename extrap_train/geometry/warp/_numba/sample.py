@@ -1,4 +1,4 @@
-"""`warp_points` on the CPU: the same points, in compiled loops parallel over references and rows.
+"""`sample` on the CPU: the same points, in compiled loops parallel over references and rows.
 
 Single precision throughout, in the same order of operations as in torch: no decision comes out
 otherwise.
@@ -8,25 +8,29 @@ import math
 
 import numba
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from extrap_train.geometry import warp_points, warp_walls
 from extrap_train.geometry.compiled import compiled
 from extrap_train.geometry.encoding import coordinate_grid
-from extrap_train.geometry.normals_numba import find_surface
-from extrap_train.geometry.warp_frustum_numba import enters
-from extrap_train.geometry.warp_points import query_centers
-from extrap_train.geometry.warp_projection import LEAST_DEPTH_RATIO, reference_to_query_pixels
-from extrap_train.geometry.warp_walls_numba import draw_walls, project
+from extrap_train.geometry.flow import flow_at_pixels
+from extrap_train.geometry.warp import occlusion, sample
+from extrap_train.geometry.warp._numba.occlusion import draw_occlusion, project
+from extrap_train.geometry.warp._numba.surface import find_surface
+from extrap_train.geometry.warp.projection import LEAST_DEPTH_RATIO, reference_to_query_pixels
+from extrap_train.geometry.warp.sample import query_centers
 from extrap_train.views import Camera
 
 _ZERO, _HALF, _ONE, _TWO = (np.float32(x) for x in (0, 0.5, 1, 2))
-_LARGEST_SPACING = np.float32(warp_points.LARGEST_SPACING)
-_REACH_MARGIN = np.float32(warp_points.REACH_MARGIN)
-_MOST_POINTS = warp_points.MOST_POINTS
+_LARGEST_SPACING = np.float32(sample.LARGEST_SPACING)
+_REACH_MARGIN = np.float32(sample.REACH_MARGIN)
+_MOST_POINTS = sample.MOST_POINTS
 _LEAST_RATIO = np.float32(LEAST_DEPTH_RATIO)
-_WALL_LIMIT = np.float32(1 + warp_walls.TOLERANCE)
+_WALL_LIMIT = np.float32(1 + occlusion.TOLERANCE)
+_RIM = np.float32(1.5)
+"""Query pixels around the image: the splat draws what lies half a pixel outside; the rest is for
+rounding."""
 _ROWS = 16
 """Rows of a reference that are filled in one go."""
 _OFFSETS = np.zeros((_MOST_POINTS + 1, _MOST_POINTS), np.float32)
@@ -76,6 +80,24 @@ def sample_surfaces_numba(
     return points, reach, values, spans.reshape(b, -1, 2)
 
 
+def move_points_numba(
+    points: Float[np.ndarray, "3 n"],
+    spans: Int[np.ndarray, "b m 2"],
+    flows: Float[Tensor, "b k 2 g g"],
+    query: Camera,
+) -> None:
+    """Move the points in place to where their reference's flow takes them."""
+    references = flows.flatten(0, 1)
+    own_spans = spans.reshape(len(references), -1, 2)
+    for flow, own in zip(references, own_spans, strict=True):
+        if not flow.any():
+            continue
+        for first, last in own:
+            pixels = points[:2, first:last]
+            step = flow_at_pixels(flow, torch.from_numpy(pixels), query.height, query.width)
+            pixels += step.numpy()
+
+
 @compiled(parallel=True)
 def _cut(
     depth: np.ndarray,
@@ -94,7 +116,7 @@ def _cut(
     rows is cut."""
     for r in numba.prange(len(depth)):
         valid = find_surface(depth[r], intrinsics[r], inverse[r], slopes[r], links[r])
-        draw_walls(inverse[r], links[r], intrinsics[r], matrix[r], unseen[r])
+        draw_occlusion(inverse[r], links[r], intrinsics[r], matrix[r], unseen[r])
         surface = (inverse[r], slopes[r], valid)
         camera = (intrinsics[r], centers[r], matrix[r])
         _cut_pixels(surface, camera, unseen[r].shape, counts[:, r], reaches[:, r], sizes[r])
@@ -117,10 +139,57 @@ def _cut_pixels(
         for x in range(inverse.shape[1]):
             across = down = 0
             facing = valid[y, x] and _faces(inverse, slopes, intrinsics, center, y, x)
-            if facing and enters(m, inverse, slopes, y, x, query_size):
+            if facing and _may_be_seen(m, inverse, slopes, y, x, query_size):
                 across, down, reaches[0, y, x], reaches[1, y, x] = _divide(m, inverse, slopes, y, x)
             counts[0, y, x], counts[1, y, x] = across, down
             sizes[y // _ROWS] += across * down
+
+
+@compiled()
+def _may_be_seen(
+    m: np.ndarray, inverse: np.ndarray, slopes: np.ndarray, y: int, x: int, size: tuple[int, int]
+) -> bool:
+    """Whether any of a pixel's surface may lie in the query's image, or within `_RIM` of it.
+
+    Close to the query a pixel is cut into many points, most of which lie outside the image: this
+    test keeps them from being made.
+    Never wrongly no; wrongly yes at most near the image's corners. In homogeneous coordinates each
+    side of the image is a linear function of the place in each quarter of the pixel, so its
+    greatest value lies at a corner.
+    """
+    height, width = np.float32(size[0]), np.float32(size[1])
+    return bool(
+        _greatest(m, inverse, slopes, y, x, _ZERO, _ZERO, _ONE) > _ZERO
+        and _greatest(m, inverse, slopes, y, x, _ONE, _ZERO, _RIM) > _ZERO
+        and _greatest(m, inverse, slopes, y, x, -_ONE, _ZERO, width + _RIM) > _ZERO
+        and _greatest(m, inverse, slopes, y, x, _ZERO, _ONE, _RIM) > _ZERO
+        and _greatest(m, inverse, slopes, y, x, _ZERO, -_ONE, height + _RIM) > _ZERO
+    )
+
+
+@compiled()
+def _greatest(
+    m: np.ndarray,
+    inverse: np.ndarray,
+    slopes: np.ndarray,
+    y: int,
+    x: int,
+    a: float,
+    b: float,
+    c: float,
+) -> float:
+    """Of `a·X + b·Y + c·ratio` over a pixel, (X, Y) / ratio being its place in the query."""
+    along_u = a * m[0, 0] + b * m[1, 0] + c * m[2, 0]
+    along_v = a * m[0, 1] + b * m[1, 1] + c * m[2, 1]
+    constant = a * m[0, 2] + b * m[1, 2] + c * m[2, 2]
+    along_w = a * m[0, 3] + b * m[1, 3] + c * m[2, 3]
+    middle = along_u * (np.float32(x) + _HALF) + along_v * (np.float32(y) + _HALF) + constant
+    middle += along_w * inverse[y, x]
+    left = -(along_u + along_w * slopes[0, y, x])
+    right = along_u + along_w * slopes[1, y, x]
+    up = -(along_v + along_w * slopes[2, y, x])
+    down = along_v + along_w * slopes[3, y, x]
+    return middle + _HALF * (max(left, right, _ZERO) + max(up, down, _ZERO))
 
 
 @compiled()
@@ -128,7 +197,7 @@ def _faces(
     inverse: np.ndarray, slopes: np.ndarray, k: np.ndarray, center: np.ndarray, y: int, x: int
 ) -> bool:
     """Whether the query's centre lies on the reference's side of the tangent plane
-    (`normals.plane_vectors`)."""
+    (`surface.plane_vectors`)."""
     away_x = (slopes[0, y, x] + slopes[1, y, x]) / _TWO * k[0, 0]
     away_y = (slopes[2, y, x] + slopes[3, y, x]) / _TWO * k[1, 1]
     ray_x = (np.float32(x) + _HALF - k[0, 2]) / k[0, 0]

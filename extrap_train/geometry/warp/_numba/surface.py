@@ -1,4 +1,4 @@
-"""`normals.surface_from_depth` on the CPU: the same arithmetic, line by line, in compiled loops.
+"""`surface.surface_from_depth` on the CPU: the same arithmetic, line by line, in compiled loops.
 
 Links are bits: 0–3 say which neighbours (left, right, upper, lower) lie on the same surface, 4–7
 on which sides a valid pixel's surface ends in front of another one.
@@ -6,14 +6,14 @@ on which sides a valid pixel's surface ends in front of another one.
 
 import numpy as np
 
-from extrap_train.geometry import normals
 from extrap_train.geometry.compiled import compiled
+from extrap_train.geometry.warp import surface
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
-_ALWAYS_SURFACE = np.float32(normals.ALWAYS_SURFACE)
-_NEVER_SURFACE = np.float32(normals.NEVER_SURFACE)
-_DEPTH_NOISE = np.float32(normals.DEPTH_NOISE)
-_LARGEST_BEND = np.float32(normals.LARGEST_BEND)
+_ALWAYS_SURFACE = np.float32(surface.ALWAYS_SURFACE)
+_NEVER_SURFACE = np.float32(surface.NEVER_SURFACE)
+_DEPTH_NOISE = np.float32(surface.DEPTH_NOISE)
+_LARGEST_BEND = np.float32(surface.LARGEST_BEND)
 
 _UNKNOWN, _LINKED, _RISES, _FALLS = 0, 1, 2, 3
 """What a step from one pixel to the next is; at a jump inverse depth rises or falls."""

@@ -8,15 +8,16 @@ from torch import Tensor
 
 from extrap_train.geometry.cameras import pixel_grid
 from extrap_train.geometry.encoding import coordinate_grid
-from extrap_train.geometry.normals import Surface, plane_vectors, surface_from_depth
-from extrap_train.geometry.splat_torch import ScreenPoints
-from extrap_train.geometry.warp_projection import (
+from extrap_train.geometry.flow import flow_at_pixels
+from extrap_train.geometry.warp.occlusion import is_occluded
+from extrap_train.geometry.warp.projection import (
     LEAST_DEPTH_RATIO,
     project_pixels,
     reference_to_query_pixels,
     subdivide,
 )
-from extrap_train.geometry.warp_walls import hidden_by_unseen
+from extrap_train.geometry.warp.splat import ScreenPoints
+from extrap_train.geometry.warp.surface import Surface, plane_vectors, surface_from_depth
 from extrap_train.views import Camera
 
 LARGEST_SPACING = 1.05
@@ -50,16 +51,19 @@ def sample_surfaces(
     """Sample every reference pixel as finely as the query sees it, with its surface's slope and
     values: in torch, differentiable in images and depths."""
     b, k, _, h, w = images.shape
+    # Normals, and where depth jumps. The query's centre must lie on the reference's side of the
+    # tangent plane n·x = 1, or the query sees the surface's back (METHOD §1.1).
     surface = surface_from_depth(depths, cameras)
-    # n·x = 1 on the tangent plane; the query's centre must lie on the reference's side of it.
     towards = plane_vectors(surface, cameras) * query_centers(cameras, query)[..., None, None, :]
     x, y, z = towards.unbind(-1)
     drawn = surface.valid & (x + y + z < 1)
+    # Cut every pixel into as many points as keep them `LARGEST_SPACING` apart in the query.
     matrix = reference_to_query_pixels(cameras, query)
     steps = _steps(surface, matrix)
     counts = torch.where(drawn[..., None], _points_per_axis(steps), 0).reshape(-1, 2)
     pixel, offset = subdivide(counts)
     corner = _Corner.around(surface, pixel, offset)
+    # K_q (R K_r⁻¹ (u, v, 1) + t/z): inverse depth is linear on the surface.
     inverse = surface.inverse_depth.reshape(-1)[pixel] + corner.steps(offset)
     u, v, ratio = project_pixels(
         matrix.reshape(-1, 3, 4)[pixel // (h * w)],
@@ -74,7 +78,8 @@ def sample_surfaces(
     reference = (pixel // (h * w))[seen]
     depth = (ratio / inverse)[seen]
     points = ScreenPoints(u[seen], v[seen], depth, reach[:, 0], reach[:, 1], reference)
-    kept = (~hidden_by_unseen(surface, matrix, cameras, query, points)).nonzero()[:, 0]
+    # Drop what lies behind space that its reference never saw, then interpolate what is left.
+    kept = (~is_occluded(surface, matrix, cameras, query, points)).nonzero()[:, 0]
     points = points[kept]
     maps = _maps(images).movedim(2, -1).reshape(b * k * h * w, -1)
     values = corner.interpolate(maps, pixel, offset, seen[kept])
@@ -157,3 +162,19 @@ class _Corner:
         towards_u, towards_v = self.neighbour[chosen].unbind(-1)
         share_u, share_v = offset[chosen].abs()[..., None].unbind(-2)
         return own + share_u * (rows[towards_u] - own) + share_v * (rows[towards_v] - own)
+
+
+def move_points(
+    points: ScreenPoints,
+    reference: Int[Tensor, " n"],
+    flows: Float[Tensor, "b k 2 g g"],
+    query: Camera,
+) -> ScreenPoints:
+    """The points where their reference's flow takes them; differentiable."""
+    u, v = points.u.clone(), points.v.clone()
+    for index, flow in enumerate(flows.flatten(0, 1)):
+        own = (reference == index).nonzero()[:, 0]
+        pixels = torch.stack([points.u[own], points.v[own]])
+        step = flow_at_pixels(flow, pixels, query.height, query.width)
+        u, v = u.index_add(0, own, step[0]), v.index_add(0, own, step[1])
+    return replace(points, u=u, v=v)
