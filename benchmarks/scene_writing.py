@@ -16,7 +16,7 @@ from benchmarks.records import SCENE_FORMAT, CameraRecord, Cameras, SceneRecord
 from benchmarks.scenes import INPUTS, Scene
 from extrap_train.config import DatasetDepthConfig, DepthConfig, RulesConfig, StereoConfig
 from extrap_train.data.images import to_eight_bits
-from extrap_train.data.module import with_warp
+from extrap_train.data.module import compute_warp
 from extrap_train.data.queries import query_batch
 from extrap_train.depth import NoDepthError
 from extrap_train.depth.build import depth_source
@@ -81,7 +81,7 @@ def _scene(
     targets = [frames[name].load().squared(size) for name in draw.targets]
     cameras = stack_cameras([view.camera for view in targets])
     depths = [view.depth for view in inputs if view.depth is not None]
-    warp = with_warp(query_batch(inputs, cameras, len(inputs), fine_size)[0], size).warp
+    warp = compute_warp(query_batch(inputs, cameras, len(inputs), fine_size)[0], size).warp
     assert warp is not None
     pictures = {
         "inputs": torch.stack([view.image for view in inputs]),

@@ -9,13 +9,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pyarrow as pa
-import torch
 from jaxtyping import Bool, Float
 
 from data_prep.correct import correct_pair
 from data_prep.select import select_pairs
 from data_prep.split import held_out
-from data_prep.tools import Tools
 from extrap_train.config import PrepConfig
 from extrap_train.data.frame_files import (
     FLOWS,
@@ -56,10 +54,16 @@ class PairFiles:
 
     @classmethod
     def of(
-        cls, root: Path, sequence: str, frames_key: str, role: str, options: PrepConfig, how: str
+        cls,
+        root: Path,
+        sequence: str,
+        frames_key: str,
+        role: str,
+        options: PrepConfig,
+        correction: str,
     ) -> "PairFiles":
-        """`how` says by what the warps are corrected; empty where they are not."""
-        content = json.dumps([frames_key, role, pair_options(options), how], sort_keys=True)
+        """`correction` identifies what the warps are corrected with; "" where they are not."""
+        content = json.dumps([frames_key, role, pair_options(options), correction], sort_keys=True)
         key = hashlib.sha256(content.encode()).hexdigest()
         return cls(pairs_folder(root, sequence, role), key)
 
@@ -145,22 +149,3 @@ def correct_pairs(
     )
     stacked = np.stack(flows) if flows else np.zeros((0, 2, grid, grid), np.float32)
     return pd.concat([pairs, made], axis=1), stacked
-
-
-def make_pairs(
-    files: PairFiles,
-    frames: StoredFrames,
-    name: str,
-    role: str,
-    options: PrepConfig,
-    tools: Tools,
-    progress: bool = False,
-) -> None:
-    """Choose and correct a sequence's pairs, unless they are there already."""
-    if files.are_there():
-        return
-    with torch.inference_mode():
-        chosen = choose_pairs(frames, name, role, options)
-        files.write(
-            *correct_pairs(frames, chosen, tools.matcher(), options.correction_grid, progress)
-        )

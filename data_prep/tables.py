@@ -4,7 +4,6 @@ import json
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -15,13 +14,13 @@ import pyarrow.parquet as pq
 
 from data_prep.filter import Verdict
 from data_prep.pairs import reference_frames
+from data_prep.sequence_job import PrepContext, SequenceJob
 from data_prep.split import Split
-from data_prep.unit import Unit, Workshop
 from extrap_train.data.frame_files import read_camera_table
 from extrap_train.data.prepared import FORMAT, TABLES, table_digest
 from extrap_train.data.sequences import Sequence
 from extrap_train.errors import InputError
-from extrap_train.store.atomic import partial_path, write_atomic
+from extrap_train.store.atomic import atomic_file, write_atomic
 from extrap_train.store.manifest import package_version
 
 _PACKAGES = ("extrap-train", "numpy", "opencv-python-headless", "pyarrow", "torch")
@@ -48,43 +47,50 @@ class Outcome:
 
 
 def write_results(
-    folder: Path, shop: Workshop, outcomes: list[Outcome], split: Split, facts: Mapping[str, Any]
+    folder: Path,
+    context: PrepContext,
+    outcomes: list[Outcome],
+    split: Split,
+    facts: Mapping[str, Any],
 ) -> None:
-    """All tables, then the manifest, whose presence says that they are complete.
+    """All tables, then the manifest, whose presence marks them complete.
 
-    It repeats `facts` about what they were made from.
+    The manifest also holds `facts`: what the data was made from.
     """
-    units = [
-        Unit(shop, outcome.sequence, split.role(outcome.name), outcome.capture_key)
+    jobs = [
+        SequenceJob(context, outcome.sequence, split.role(outcome.name), outcome.capture_key)
         for outcome in outcomes
         if outcome.verdict.kept
     ]
-    counts = _write_frames_and_pairs(folder, units)
+    frames: Counter[str] = Counter()
+    pairs: Counter[tuple[str, str]] = Counter()
+    _write_table(folder / "frames.parquet", _frame_tables(jobs, frames))
+    _write_table(folder / "pairs.parquet", _pair_tables(jobs, pairs))
     parts: Counter[str] = Counter()
-    for (_, part), count in counts.pairs.items():
+    for (_, part), count in pairs.items():
         parts[part] += count
     if not parts["train"]:
         raise InputError(
-            f"{folder}: no two frames of the {len(units)} kept sequences make a training pair; "
+            f"{folder}: no two frames of the {len(jobs)} kept sequences make a training pair; "
             "widen prep.min_pair_angle_deg and prep.max_pair_angle_deg, or add photographs"
         )
-    rows = pa.Table.from_pandas(_sequence_rows(outcomes, split, counts), preserve_index=False)
-    with _writer(folder / "sequences.parquet") as write:
-        write(rows)
+    rows = [_sequence_row(outcome, split, frames, pairs) for outcome in outcomes]
+    table = pa.Table.from_pandas(pd.DataFrame(rows), preserve_index=False)
+    _write_table(folder / "sequences.parquet", iter([table]))
     write_atomic(folder / "split.json", split.to_json().encode())
-    failed = sum(outcome.failed for outcome in outcomes)
+    failed, models = sum(outcome.failed for outcome in outcomes), context.models
     manifest = {
         "format": FORMAT,
         **facts,
-        "depth": repr(shop.tools.depth),
-        "options": asdict(shop.options),
-        "correction": None if shop.tools.correction is None else repr(shop.tools.correction),
-        "frames": os.path.relpath(shop.frames, folder),
-        "pair_files": os.path.relpath(shop.pairs, folder),
+        "depth": repr(models.depth),
+        "options": asdict(context.options),
+        "correction": None if models.correction is None else repr(models.correction),
+        "frames": os.path.relpath(context.frames_root, folder),
+        "pair_files": os.path.relpath(context.pairs_root, folder),
         "split": json.loads(split.to_json())["sha256"],
         "sequences": {
-            "kept": len(units),
-            "dropped": len(outcomes) - len(units) - failed,
+            "kept": len(jobs),
+            "dropped": len(outcomes) - len(jobs) - failed,
             "failed": failed,
         },
         "pairs": dict(sorted(parts.items())),
@@ -94,104 +100,64 @@ def write_results(
     write_atomic(folder / "manifest.json", (json.dumps(manifest, indent=1) + "\n").encode())
 
 
-@dataclass(frozen=True)
-class _Counts:
-    """How many there are of what is stored."""
-
-    frames: Counter[str]
-    """By sequence."""
-    pairs: Counter[tuple[str, str]]
-    """By sequence and split."""
-
-
-def _write_frames_and_pairs(folder: Path, units: list[Unit]) -> _Counts:
-    """Both tables from the sequences' own, one after the other."""
-    counts = _Counts(Counter(), Counter())
-    with (
-        _writer(folder / "frames.parquet") as write_frames,
-        _writer(folder / "pairs.parquet") as write_pairs,
-    ):
-        for unit in units:
-            cameras = read_camera_table(unit.frames_folder, unit.frames_key)
-            pairs = unit.pair_files.read()
-            if cameras is None or pairs is None:
-                raise InputError(
-                    f"{unit.frames_folder}: vanished or changed meanwhile; run data_prep again"
-                )
-            write_frames(_frame_rows(unit, cameras))
-            write_pairs(pairs.replace_schema_metadata(None))
-            counts.frames[unit.name] = cameras.num_rows
-            counts.pairs.update((unit.name, part) for part in pairs["split"].to_pylist())
-    return counts
+def _frame_tables(jobs: list[SequenceJob], counts: Counter[str]) -> Iterator[pa.Table]:
+    """Each sequence's frames; counts them by sequence."""
+    for job in jobs:
+        cameras = read_camera_table(job.frames_folder, job.frames_key)
+        if cameras is None:
+            raise _vanished(job)
+        counts[job.name] = cameras.num_rows
+        references = reference_frames(cameras["depth_share"].to_numpy(), job.is_lone)
+        names = pa.array([job.name] * cameras.num_rows, pa.string())
+        rows = cameras.replace_schema_metadata(None).add_column(0, "sequence", names)
+        yield rows.append_column("reference", pa.array(references))
 
 
-def _frame_rows(unit: Unit, cameras: pa.Table) -> pa.Table:
-    shares = cameras["depth_share"].to_numpy()
-    references = reference_frames(shares, unit.is_lone)
-    names = pa.array([unit.name] * cameras.num_rows, pa.string())
-    rows = cameras.replace_schema_metadata(None).add_column(0, "sequence", names)
-    return rows.append_column("reference", pa.array(references))
+def _pair_tables(jobs: list[SequenceJob], counts: Counter[tuple[str, str]]) -> Iterator[pa.Table]:
+    """Each sequence's pairs; counts them by sequence and split."""
+    for job in jobs:
+        pairs = job.pair_files.read()
+        if pairs is None:
+            raise _vanished(job)
+        counts.update((job.name, part) for part in pairs["split"].to_pylist())
+        yield pairs.replace_schema_metadata(None)
 
 
-def _sequence_rows(outcomes: list[Outcome], split: Split, counts: _Counts) -> pd.DataFrame:
-    rows: list[dict[str, Any]] = [
-        {
-            "sequence": outcome.name,
-            **asdict(outcome.verdict),
-            **_frame_counts(outcome, counts),
-            "failed": outcome.failed,
-            "viewpoint_quality": outcome.sequence.viewpoint_quality,
-            "point_cloud_quality": outcome.sequence.point_cloud_quality,
-            "split": split.role(outcome.name) if outcome.verdict.kept else "",
-            "pairs": sum(counts.pairs[outcome.name, part] for part in ("train", "test")),
-        }
-        for outcome in outcomes
-    ]
-    return pd.DataFrame(rows)
+def _vanished(job: SequenceJob) -> InputError:
+    return InputError(f"{job.frames_folder}: vanished or changed meanwhile; run data_prep again")
 
 
-def _frame_counts(outcome: Outcome, counts: _Counts) -> dict[str, int]:
-    """Stored frames, and those that could not be used; of a dropped sequence all that it has."""
-    taken = outcome.verdict.frames
-    stored = counts.frames[outcome.name] if outcome.verdict.kept else taken
-    unread = len(outcome.sequence.left_out)
-    return {"frames": stored, "frames_left_out": taken - stored + unread}
+def _sequence_row(
+    outcome: Outcome,
+    split: Split,
+    frames: Counter[str],
+    pairs: Counter[tuple[str, str]],
+) -> dict[str, Any]:
+    """`frames` counts those that are stored; of a dropped sequence, all that it has."""
+    verdict, sequence = outcome.verdict, outcome.sequence
+    stored = frames[outcome.name] if verdict.kept else verdict.frames
+    return {
+        "sequence": outcome.name,
+        **asdict(verdict),
+        "frames": stored,
+        "frames_left_out": verdict.frames - stored + len(sequence.left_out),
+        "failed": outcome.failed,
+        "viewpoint_quality": sequence.viewpoint_quality,
+        "point_cloud_quality": sequence.point_cloud_quality,
+        "split": split.role(outcome.name) if verdict.kept else "",
+        "pairs": sum(pairs[outcome.name, part] for part in ("train", "test")),
+    }
 
 
-class _Rows:
-    """Tables of one schema, gathered until it is worth writing them."""
-
-    def __init__(self, file: Path) -> None:
-        self.file = file
-        self.waiting: list[pa.Table] = []
-        self.writer: pq.ParquetWriter | None = None
-
-    def add(self, table: pa.Table) -> None:
-        """Take rows, and write what has come together if it is enough."""
-        self.waiting.append(table)
-        if sum(part.num_rows for part in self.waiting) >= _ROWS_AT_A_TIME:
-            self.write()
-
-    def write(self) -> None:
-        """Write what waits."""
-        if not self.waiting:
-            return
-        rows = pa.concat_tables(self.waiting)
-        self.waiting.clear()
-        self.writer = self.writer or pq.ParquetWriter(self.file, rows.schema)
-        self.writer.write_table(rows)
-
-
-@contextmanager
-def _writer(file: Path) -> Iterator[Any]:
-    """A function that takes the rows of `file`, which is there whole or not at all."""
-    temporary = partial_path(file)
-    rows = _Rows(temporary)
-    try:
-        yield rows.add
-        rows.write()
-        if rows.writer is not None:
-            rows.writer.close()
-            temporary.replace(file)
-    finally:
-        temporary.unlink(missing_ok=True)
+def _write_table(file: Path, parts: Iterator[pa.Table]) -> None:
+    """Write the parts, of which there is at least one, as one table."""
+    first = next(parts)
+    waiting, rows = [first], first.num_rows
+    with atomic_file(file) as temporary, pq.ParquetWriter(temporary, first.schema) as writer:
+        for part in parts:
+            if rows >= _ROWS_AT_A_TIME:
+                writer.write_table(pa.concat_tables(waiting))
+                waiting, rows = [], 0
+            waiting.append(part)
+            rows += part.num_rows
+        writer.write_table(pa.concat_tables(waiting))

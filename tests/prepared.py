@@ -3,7 +3,7 @@
 from collections.abc import Sequence as Some
 from pathlib import Path
 
-from data_prep.build import prepare
+from data_prep.preparation import prepare
 from extrap_train.config import PrepConfig
 from extrap_train.data.prepared import PreparedData
 from extrap_train.data.sequences import Sequence

@@ -356,7 +356,7 @@ def test_data_prep_takes_threads_for_its_processes(
     asked: list[int | None] = []
     take = "extrap_train.tasks.prepare.prepare_category"
     monkeypatch.setattr(take, lambda *_, **options: asked.append(options["workers"]))
-    monkeypatch.setattr("data_prep.report.write_report", lambda *_: None)
+    monkeypatch.setattr("data_prep.prep_report.write_report", lambda *_: None)
     monkeypatch.setattr(sys, "argv", ["it", "category=hydrant", *words])
     prepare()
     assert asked == [workers]

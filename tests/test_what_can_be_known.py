@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from extrap_train.config import DatasetDepthConfig, FlowMatcherConfig, PrepConfig, SyntheticConfig
-from extrap_train.data.examples import ExampleReader
-from extrap_train.data.module import ValidationBatches, spread, with_warp
+from extrap_train.data.examples import ExampleReader, linspace_indices
+from extrap_train.data.module import ValidationBatches, compute_warp
 from extrap_train.diffusion.baselines import mean_filled_warp
 from extrap_train.metrics import psnr, quantised
 from extrap_train.tasks.prepare import prepare_category
@@ -36,8 +36,8 @@ def _held_out(output: Path) -> tuple[PairBatch, Bool[Tensor, "b 1 h w"], Bool[Te
         matcher=FlowMatcherConfig(),
     )
     reader, pairs = ExampleReader([prepared], "test", _REFERENCES), prepared.pairs("test")
-    chosen = spread(len(reader), _VIEWS)
-    batch = with_warp(ValidationBatches(reader, chosen, _VIEWS, _REFERENCES)[0], _SIZE)
+    chosen = linspace_indices(len(reader), _VIEWS)
+    batch = compute_warp(ValidationBatches(reader, chosen, _VIEWS, _REFERENCES)[0], _SIZE)
     truths = [prepared.frames(pairs[i].sequence, [pairs[i].query]) for i in chosen]
     depth = functional.avg_pool2d(torch.stack([depth for _, depth, _ in truths]), 2)
     mask = functional.avg_pool2d(torch.stack([mask for _, _, mask in truths]), 2) > 0.5

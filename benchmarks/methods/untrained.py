@@ -8,7 +8,7 @@ import torch
 
 from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis, photographs_used
 from benchmarks.methods.references import nearest_inputs, views_with_depth
-from extrap_train.data.module import with_warp
+from extrap_train.data.module import compute_warp
 from extrap_train.data.queries import query_batch
 from extrap_train.diffusion.baselines import inpainted_warp
 
@@ -49,7 +49,7 @@ class InpaintedWarp:
         with Stopwatch() as watch:
             views, size = views_with_depth(inputs), inputs.targets.height
             batch = query_batch(views, inputs.targets, self.references, views[0].camera.height)[0]
-            batch = with_warp(batch, size)
+            batch = compute_warp(batch, size)
             assert batch.warp is not None
             images = inpainted_warp(batch.warp).clamp(0, 1)
         return Synthesis(images, watch.seconds / len(images), photographs_used(views))

@@ -13,7 +13,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.perf.warp import ANGLES_DEG, QUERY_ANGLE_DEG, orbit_camera
 from extrap_train.config import ClipConfig, ModelConfig, UNetConfig, VaeConfig
-from extrap_train.data.module import with_warp
+from extrap_train.data.module import compute_warp
 from extrap_train.diffusion.frozen import Frozen
 from extrap_train.diffusion.layout import arranged
 from extrap_train.diffusion.memory import LiveBytes
@@ -98,7 +98,7 @@ def batch_of(count: int, device: torch.device) -> PairBatch:
         reference_depths=torch.full((*shape, IMAGE_SIZE, IMAGE_SIZE), 3.0),
         reference_valid=torch.ones(shape, dtype=torch.bool),
     )
-    return with_warp(batch.to(device))
+    return compute_warp(batch.to(device))
 
 
 def forward_flops(config: ModelConfig) -> int:

@@ -14,10 +14,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from benchmarks.perf.timing import Row, compare
-from data_prep.build import prepare
 from data_prep.correct import correct_pair, draw
 from data_prep.frames import make_frames
 from data_prep.pairs import choose_pairs
+from data_prep.preparation import prepare
 from data_prep.synthesize import synthesize
 from extrap_train.config import FlowMatcherConfig, PrepConfig, StereoConfig, SyntheticConfig
 from extrap_train.data import sequences as captures

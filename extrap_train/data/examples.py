@@ -26,23 +26,23 @@ class Example:
     reference_flows: Float[Tensor, "k 2 g g"] | None = None
 
 
-def mirrored(example: Example) -> Example:
+def mirror(example: Example) -> Example:
     """The example in a mirror: left and right exchanged in images, cameras and world alike."""
     return Example(
         example.image.flip(-1),
-        _mirrored_camera(example.camera),
+        _mirror_camera(example.camera),
         example.reference_images.flip(-1),
-        _mirrored_camera(example.reference_cameras),
+        _mirror_camera(example.reference_cameras),
         example.reference_depths.flip(-1),
-        None if example.reference_flows is None else _mirrored_flows(example.reference_flows),
+        None if example.reference_flows is None else _mirror_flows(example.reference_flows),
     )
 
 
-def _mirrored_flows(flows: Float[Tensor, "k 2 g g"]) -> Float[Tensor, "k 2 g g"]:
+def _mirror_flows(flows: Float[Tensor, "k 2 g g"]) -> Float[Tensor, "k 2 g g"]:
     return flows.flip(-1) * flows.new_tensor([-1.0, 1.0])[:, None, None]
 
 
-def _mirrored_camera(camera: Camera) -> Camera:
+def _mirror_camera(camera: Camera) -> Camera:
     """Reflect the world and the camera along x: the product of both keeps the rotation proper."""
     mirror = torch.diag(camera.world_to_cam.new_tensor([-1.0, 1.0, 1.0, 1.0]))
     intrinsics = camera.intrinsics.clone()
@@ -81,6 +81,21 @@ def _flows(
     return torch.stack([none if flows is None else flows[order] for flows, order in chosen])
 
 
+def read_example(data: PreparedData, pair: ViewPair, is_corrected: bool) -> Example:
+    """The pair's example with all its references, and with their flows if `is_corrected`."""
+    frames = [pair.query, *pair.references]
+    images, depths, _ = data.frames(pair.sequence, frames)
+    cameras = data.cameras(pair.sequence)[torch.tensor(frames)]
+    flows = data.flows(pair.sequence, pair.references, pair.query) if is_corrected else None
+    return Example(images[0], cameras[0], images[1:], cameras[1:], depths[1:], flows)
+
+
+def linspace_indices(available: int, wanted: int) -> list[int]:
+    """At most `wanted` indices, spread evenly over `available` places."""
+    count = min(available, wanted)
+    return torch.linspace(0, available - 1, count).round().long().tolist() if count else []
+
+
 class ExampleReader:
     """Examples of one split of one or several prepared categories."""
 
@@ -107,7 +122,7 @@ class ExampleReader:
         """The pair's example with up to `count` references; those after the first are drawn."""
         data, pair = self._pairs[index]
         references = self._references(data, pair, count, rng)
-        return self._example(data, pair.sequence, pair.query, references)
+        return read_example(data, replace(pair, references=references), self._is_corrected(data))
 
     def collate(self, examples: list[Example]) -> PairBatch:
         """A batch with room for the reader's number of references."""
@@ -115,12 +130,12 @@ class ExampleReader:
 
     def _references(
         self, data: PreparedData, pair: ViewPair, count: int, rng: np.random.Generator
-    ) -> list[int]:
+    ) -> tuple[int, ...]:
         """Frames that the pair's query is seen from, nearest first; the pair's own is the first."""
         first = pair.references[0]
         angles = self._angles_of(data, pair.sequence)
         candidates = self._candidates(data, pair.sequence, pair.query)
-        return [first, *extra_references(angles, pair.query, first, count, rng, candidates)]
+        return (first, *extra_references(angles, pair.query, first, count, rng, candidates))
 
     def _candidates(self, data: PreparedData, sequence: str, query: int) -> np.ndarray:
         """Frames that it may be seen from: those whose correction is known, where there is one."""
@@ -130,15 +145,6 @@ class ExampleReader:
 
     def _is_corrected(self, data: PreparedData) -> bool:
         return self._split == "train" and data.is_corrected
-
-    def _example(
-        self, data: PreparedData, sequence: str, query: int, references: list[int]
-    ) -> Example:
-        frames = [query, *references]
-        images, depths, _ = data.frames(sequence, frames)
-        cameras = data.cameras(sequence)[torch.tensor(frames)]
-        flows = data.flows(sequence, references, query) if self._is_corrected(data) else None
-        return Example(images[0], cameras[0], images[1:], cameras[1:], depths[1:], flows)
 
     def _angles_of(self, data: PreparedData, sequence: str) -> np.ndarray:
         key = (data.folder, sequence)  # no `id`: it means nothing in a worker process

@@ -5,10 +5,9 @@ from dataclasses import replace
 
 import lightning
 import numpy as np
-import torch
 from torch.utils.data import DataLoader, Dataset, Sampler
 
-from extrap_train.data.examples import Example, ExampleReader, mirrored
+from extrap_train.data.examples import Example, ExampleReader, linspace_indices, mirror
 from extrap_train.geometry.reduction import reduced_batch
 from extrap_train.geometry.warp import warp_references
 from extrap_train.views import PairBatch
@@ -17,7 +16,7 @@ Positions = list[tuple[int, int]]
 """(position in the endless stream of examples, index of the pair)."""
 
 
-def with_warp(batch: PairBatch, image_size: int | None = None) -> PairBatch:
+def compute_warp(batch: PairBatch, image_size: int | None = None) -> PairBatch:
     """The batch with its warp, made on the device where the batch lies.
 
     The warp is made at the batch's own size; then everything is reduced to `image_size`, of which
@@ -95,7 +94,7 @@ class TrainingBatches(Dataset[PairBatch]):
             rng = np.random.default_rng((self.seed, position))
             count = int(rng.integers(1, self.references + 1))
             example = self.reader.read(pair, count, rng)
-            examples.append(mirrored(example) if rng.random() < 0.5 else example)
+            examples.append(mirror(example) if rng.random() < 0.5 else example)
         return self.reader.collate(examples)
 
 
@@ -145,7 +144,7 @@ class PairModule(lightning.LightningDataModule):
         self.validation_batch_size = validation_batch_size
         self.references = references
         self.workers, self.seed = workers, seed
-        self.chosen = spread(len(validation), validation_examples)
+        self.chosen = linspace_indices(len(validation), validation_examples)
 
     def train_dataloader(self) -> DataLoader[PairBatch]:
         """The batches up to the next checkpoint, at a multiple of `batches_per_epoch` steps."""
@@ -170,7 +169,7 @@ class PairModule(lightning.LightningDataModule):
         )
         trainer = self.trainer
         rank, world = (trainer.global_rank, trainer.world_size) if trainer else (0, 1)
-        return self._loader(dataset, shared_out(len(dataset.batches), rank, world))
+        return self._loader(dataset, shard(len(dataset.batches), rank, world))
 
     def _loader(
         self, dataset: Dataset[PairBatch], sampler: Sampler[Positions] | list[int]
@@ -185,17 +184,12 @@ class PairModule(lightning.LightningDataModule):
 
     def on_after_batch_transfer(self, batch: PairBatch, dataloader_idx: int) -> PairBatch:
         """Lightning's hook: warps are computed, not stored."""
-        return with_warp(batch, self.image_size)
+        return compute_warp(batch, self.image_size)
 
 
-def shared_out(batches: int, rank: int, world: int) -> list[int]:
-    """Indices of the batches that fall to a process; to one too many the last batch once more:
-    Lightning runs no validation, and no exchange at its end, in a process without a batch.
+def shard(batches: int, rank: int, world: int) -> list[int]:
+    """Indices of a process's batches; a process too many repeats the last one.
+
+    In a process without a batch, Lightning runs no validation and no exchange at its end.
     """
     return list(range(rank, batches, world)) or [batches - 1]
-
-
-def spread(available: int, wanted: int) -> list[int]:
-    """Indices spread evenly over `available` places."""
-    count = min(available, wanted)
-    return torch.linspace(0, available - 1, count).round().long().tolist() if count else []

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from extrap_train.data.module import with_warp
+from extrap_train.data.module import compute_warp
 from extrap_train.data.queries import query_batch
 from extrap_train.geometry.fill import fill_holes
 from extrap_train.geometry.orbits import turned_cameras
@@ -43,7 +43,7 @@ def virtual_references(views: Sequence[View], count: int, seed: int) -> list[Vir
         sides = np.where(np.arange(count) % 2, 1.0, -1.0)
         cameras = turned_cameras(view.camera, pivots[query], axis, angles * sides)
         batch, _ = query_batch([view], cameras, 1, view.camera.height)
-        warp = with_warp(batch).warp
+        warp = compute_warp(batch).warp
         assert warp is not None
         images = fill_holes(warp.image, warp.mask).clamp(0, 1)
         made += [

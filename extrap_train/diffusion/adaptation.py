@@ -14,7 +14,7 @@ from lightning.fabric import Fabric
 from torch import Tensor
 
 from extrap_train.config import LoraConfig, SamplerConfig
-from extrap_train.data.module import with_warp
+from extrap_train.data.module import compute_warp
 from extrap_train.data.scene_pairs import AdaptationPairs
 from extrap_train.diffusion.conditioning import Conditioning
 from extrap_train.diffusion.loss import Anchor, Unchanged, diffusion_loss, prediction_errors
@@ -103,7 +103,7 @@ def adapt(
         optimizer.param_groups[0]["lr"] = rate * min(1.0, (step + 1) / _WARMUP)
         rng = np.random.default_rng((seed, step))
         batch = pairs.training_batch(options.batch_size, rng)
-        batch = with_warp(batch.to(fabric.device), model.config.image_size)
+        batch = compute_warp(batch.to(fabric.device), model.config.image_size)
         generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
         with fabric.autocast():
             anchor = _anchor(batch, anchored)
@@ -165,7 +165,7 @@ class _HeldOut:
 
     @torch.no_grad()
     def _part(self, batch: PairBatch) -> _Part:
-        batch = with_warp(batch.to(self.fabric.device), self.model.config.image_size)
+        batch = compute_warp(batch.to(self.fabric.device), self.model.config.image_size)
         with self.fabric.autocast():
             conditioning = self.model.condition(batch)
             target = self.model.encode_target(batch.image, conditioning)

@@ -85,7 +85,7 @@ def filled_warp(warp: Warp) -> Float[Tensor, "b 3 h w"]:
 def warp_of(batch: PairBatch) -> Warp:
     """The batch's warp; ValueError where it has none yet."""
     if batch.warp is None:
-        raise ValueError("the batch has no warp yet: call `with_warp` first")
+        raise ValueError("the batch has no warp yet: call `compute_warp` first")
     return batch.warp
 
 

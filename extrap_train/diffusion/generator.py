@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrap_train.config import SamplerConfig
-from extrap_train.data.module import with_warp
+from extrap_train.data.module import compute_warp
 from extrap_train.data.queries import query_batch
 from extrap_train.device import autocast
 from extrap_train.diffusion.model import ExtrapolationModel
@@ -101,7 +101,7 @@ class DiffusionGenerator:
         # Geometry keeps its precision where the network runs in less.
         with torch.autocast(device.type, enabled=False):
             batch, chosen = query_batch(references, queries, most, size)
-            batch = with_warp(batch.to(device), config.image_size)
+            batch = compute_warp(batch.to(device), config.image_size)
         with autocast(device, self.precision):
             images = sample_views(self.model, batch, self.sampler, names, seed)
         assert batch.warp is not None

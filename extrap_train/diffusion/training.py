@@ -11,7 +11,8 @@ from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 
 from extrap_train.config import TrainConfig, TrainerConfig, sampler_for
-from extrap_train.data.module import shared_out, spread
+from extrap_train.data.examples import linspace_indices
+from extrap_train.data.module import shard
 from extrap_train.diffusion.evaluation import (
     Prediction,
     better_than_baselines,
@@ -70,7 +71,7 @@ class CategoryTraining(lightning.LightningModule):
     def validation_step(self, batch: PairBatch, batch_idx: int) -> None:
         """Sample the batch's queries."""
         of_all = len(self.validation_names)
-        index = shared_out(of_all, self.global_rank, self.trainer.world_size)[batch_idx]
+        index = shard(of_all, self.global_rank, self.trainer.world_size)[batch_idx]
         named = [(batch, self.validation_names[index])]
         made = next(predict(self.model, named, self.sampler, self.config.seed))
         if not made.images["model"].isfinite().all():
@@ -92,7 +93,7 @@ class CategoryTraining(lightning.LightningModule):
         own = {index: score(made, self.distance) for index, made in self.predictions.items()}
         self.tables = {index: table for tables in gathered(own) for index, table in tables.items()}
         names = [name for batch in self.validation_names for name in batch]
-        shown = [names[i] for i in spread(len(names), self.config.validation.pictures)]
+        shown = [names[i] for i in linspace_indices(len(names), self.config.validation.pictures)]
         self._shown = views_named(
             gathered(views_named(list(self.predictions.values()), shown)), shown
         )

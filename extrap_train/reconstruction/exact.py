@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrap_train.data.module import with_warp
+from extrap_train.data.module import compute_warp
 from extrap_train.data.queries import query_batch
 from extrap_train.data.synthetic import SyntheticScene, render, trace
 from extrap_train.depth import DepthMap, PointMaps, point_maps_of
@@ -36,7 +36,7 @@ class ExactGenerator:
     ) -> GeneratedViews:
         """The true pictures; the seed changes nothing."""
         batch, chosen = query_batch(references, queries, REFERENCES, self.image_size)
-        batch = with_warp(batch)
+        batch = compute_warp(batch)
         images = [self.photograph(batch.camera[i]) for i in range(len(queries.world_to_cam))]
         assert batch.warp is not None
         return GeneratedViews(torch.stack(images), batch.camera, batch.warp, chosen)

@@ -12,10 +12,10 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from data_prep.build import prepare
+from data_prep.model_cache import PrepModels
 from data_prep.pairs import pair_options
+from data_prep.preparation import prepare
 from data_prep.synthesize import synthesize
-from data_prep.tools import Tools
 from extrap_train.config import (
     CategoryConfig,
     Co3dConfig,
@@ -60,15 +60,15 @@ def prepare_category(
 ) -> PreparedData:
     """Sequences of one category as pairs on disk; what is there already is used again.
 
-    `workers` are local processes, None as many as suit (`Tools.default_workers`). With `retry`,
-    sequences that failed before are tried again. Paths are followed to where they lead, so that
-    other spellings of one are the same preparation.
+    `workers` are local processes, by default `PrepModels.default_workers`. With `retry`, sequences
+    that failed before are tried again. Paths are followed to where they lead, so that other
+    spellings of one are the same preparation.
     """
     data, depth, matcher = placed(data), placed(depth), placed(matcher)
     how = matcher if is_corrected(data, depth, prep) else None
-    tools = Tools(depth, how)
-    tools.check()  # before anything is rendered
-    workers = workers or tools.default_workers()
+    models = PrepModels(depth, how)
+    models.check()  # before anything is rendered
+    workers = workers or models.default_workers()
     correction = asdict(how) if how else None
     frames_of = [category, _source(data), asdict(depth), prep.image_size]
     pairs_of = [*frames_of, pair_options(prep), correction]

@@ -11,9 +11,9 @@ import torch
 from lightning.fabric import Fabric
 from rich.console import Console
 
-from data_prep.views import target_views
+from data_prep.scene_views import target_views
 from extrap_train.config import TrainConfig, dotted, sampler_for
-from extrap_train.data.module import spread
+from extrap_train.data.examples import linspace_indices
 from extrap_train.data.scene import scene_address
 from extrap_train.data.scene_pairs import AdaptationPairs, adaptation_pairs
 from extrap_train.data.sequences import Frame, Sequence
@@ -142,7 +142,7 @@ def _frames_read(config: TrainConfig, sequence: Sequence) -> list[Frame]:
     inputs = [part.frames[i] for i in chosen]
     names = {frame.name for frame in inputs}
     others = [frame for frame in sequence.frames if frame.name not in names]
-    return inputs + [others[i] for i in spread(len(others), config.validation.examples)]
+    return inputs + [others[i] for i in linspace_indices(len(others), config.validation.examples)]
 
 
 def _lpips_digest(config: TrainConfig) -> dict[str, str]:
@@ -204,7 +204,7 @@ def _is_whole(folder: Path) -> bool:
 
 
 def _targets(config: TrainConfig, inputs: SceneInputs, model: ExtrapolationModel) -> list[View]:
-    chosen = spread(len(inputs.others), config.validation.examples)
+    chosen = linspace_indices(len(inputs.others), config.validation.examples)
     return target_views([inputs.others[i] for i in chosen], model.config.image_size)
 
 

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from typing import Any
 
-from data_prep.tools import weight_files
+from data_prep.model_cache import weight_files
 from extrap_train.config import SyntheticConfig, TrainConfig, dotted
 from extrap_train.data.scene import SYNTHETIC_SCHEME, scene_address
 from extrap_train.data.sequences import Frame

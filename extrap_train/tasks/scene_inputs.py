@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-from data_prep.views import choose_frames, input_views
+from data_prep.scene_views import choose_frames, input_views
 from extrap_train.config import SyntheticConfig, TrainConfig
 from extrap_train.data.photographs import CATEGORY
 from extrap_train.data.scene import open_scene

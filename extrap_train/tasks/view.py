@@ -12,7 +12,7 @@ import torch
 from rich.console import Console
 
 from data_prep.frames import object_square
-from data_prep.views import choose_frames, input_views
+from data_prep.scene_views import choose_frames, input_views
 from extrap_train.config import (
     DatasetDepthConfig,
     DepthConfig,

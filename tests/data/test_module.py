@@ -7,8 +7,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from extrap_train.data.examples import Example, mirrored
-from extrap_train.data.module import PositionSampler, spread, with_warp
+from extrap_train.data.examples import Example, linspace_indices, mirror
+from extrap_train.data.module import PositionSampler, compute_warp
 from extrap_train.views import Camera, PairBatch
 
 
@@ -41,9 +41,9 @@ def test_ranks_share_the_stream_without_overlap() -> None:
 
 
 def test_spread_reaches_both_ends() -> None:
-    assert spread(10, 4) == [0, 3, 6, 9]
-    assert spread(2, 9) == [0, 1]
-    assert spread(0, 3) == []
+    assert linspace_indices(10, 4) == [0, 3, 6, 9]
+    assert linspace_indices(2, 9) == [0, 1]
+    assert linspace_indices(0, 3) == []
 
 
 def _example(batch: PairBatch) -> Example:
@@ -85,21 +85,21 @@ def wall_batch() -> PairBatch:
 
 def test_the_warp_of_the_mirror_is_the_mirror_of_the_warp(wall_batch: PairBatch) -> None:
     example = _example(wall_batch)
-    plain = with_warp(_batch(example, wall_batch)).warp
-    mirror = with_warp(_batch(mirrored(example), wall_batch)).warp
+    plain = compute_warp(_batch(example, wall_batch)).warp
+    flipped = compute_warp(_batch(mirror(example), wall_batch)).warp
     assert plain is not None
-    assert mirror is not None
-    agree = (plain.mask == mirror.mask.flip(-1)).float().mean()
+    assert flipped is not None
+    agree = (plain.mask == flipped.mask.flip(-1)).float().mean()
     assert agree > 0.98
-    both = (plain.mask * mirror.mask.flip(-1))[:, None]
-    difference = ((plain.image - mirror.image.flip(-1)) * both).abs()
+    both = (plain.mask * flipped.mask.flip(-1))[:, None]
+    difference = ((plain.image - flipped.image.flip(-1)) * both).abs()
     assert float(difference.mean()) < 2e-3
 
 
 def test_mirroring_twice_changes_nothing(wall_batch: PairBatch) -> None:
     example = _example(wall_batch)
-    again = mirrored(mirrored(example))
+    again = mirror(mirror(example))
     torch.testing.assert_close(again.camera.world_to_cam, example.camera.world_to_cam)
     torch.testing.assert_close(again.camera.intrinsics, example.camera.intrinsics)
     assert torch.equal(again.image, example.image)
-    assert torch.linalg.det(mirrored(example).camera.world_to_cam) > 0
+    assert torch.linalg.det(mirror(example).camera.world_to_cam) > 0

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from orbits import capture, even, ring
 
-from data_prep.build import prepare
+from data_prep.preparation import prepare
 from extrap_train.config import PrepConfig
 from extrap_train.data.frame_files import (
     SequenceFrames,

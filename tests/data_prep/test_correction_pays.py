@@ -14,7 +14,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from data_prep.build import prepare
+from data_prep.preparation import prepare
 from data_prep.synthesize import synthesize
 from extrap_train.cli import register_schemas, typed_config
 from extrap_train.config import FlowMatcherConfig, SyntheticConfig, TrainConfig

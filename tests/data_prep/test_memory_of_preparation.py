@@ -18,8 +18,8 @@ from typing import Any
 import pytest
 from captures import frame_entries, write_capture
 
-from data_prep.tools import Tools
-from data_prep.unit import Unit, Workshop
+from data_prep.model_cache import PrepModels
+from data_prep.sequence_job import PrepContext, SequenceJob
 from extrap_train.config import DatasetDepthConfig, PrepConfig
 from extrap_train.data import co3d, json_files
 from extrap_train.data.co3d import read_category
@@ -81,10 +81,12 @@ def test_what_is_kept_of_a_frame_is_small(
 
 
 def test_a_job_takes_its_own_sequence_along_and_no_other(photographs: Path) -> None:
-    shop = Workshop(Tools(DatasetDepthConfig(), None), PrepConfig(), photographs, photographs)
+    shop = PrepContext(
+        PrepModels(DatasetDepthConfig(), None), PrepConfig(), photographs, photographs
+    )
 
     def job(sequences: list[Sequence]) -> int:
-        return len(pickle.dumps(Unit(shop, sequences[0], "train", "key")))
+        return len(pickle.dumps(SequenceJob(shop, sequences[0], "train", "key")))
 
     annotate(photographs, 2)
     few = job(read_category(photographs, "cup"))

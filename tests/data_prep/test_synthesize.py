@@ -5,12 +5,10 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from captures import write_capture
 
-from data_prep.gallery import gallery
 from data_prep.synthesize import synthesize
 from extrap_train.config import SyntheticConfig
 from extrap_train.data.co3d import read_category
@@ -151,9 +149,3 @@ def test_a_full_disk_is_one_line(tmp_path):
     (tmp_path / "apple").write_text("a file where a folder belongs")
     with pytest.raises(InputError, match="cannot be written"):
         synthesize(SMALL, "apple", tmp_path, LocalLauncher(1))
-
-
-def test_the_gallery_has_a_row_for_each_category():
-    picture = gallery(sequences=1, views=2, image_size=8)
-    assert picture.shape == (3, 48, 16)
-    assert np.isfinite(picture.numpy()).all()

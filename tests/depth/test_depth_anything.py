@@ -15,7 +15,7 @@ from transformers import (
     DPTImageProcessor,
 )
 
-from data_prep.tools import Tools
+from data_prep.model_cache import PrepModels
 from extrap_train.config import FlowMatcherConfig, MonocularConfig
 from extrap_train.depth.build import depth_source
 from extrap_train.depth.depth_anything import files_read, read_depth_anything
@@ -156,6 +156,6 @@ def test_a_new_revision_of_a_downloaded_model_is_other_weights(folder, tmp_path,
         (model / "snapshots" / revision).mkdir(parents=True)
         for file in files_read(str(folder)):
             shutil.copy(file, model / "snapshots" / revision)
-        found.append(Tools(options, None).depth_identity)
+        found.append(PrepModels(options, None).depth_identity)
         assert {file.parent.name for file in files_read(options.model)} == {revision}
     assert found[0] != found[1]

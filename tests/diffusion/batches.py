@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from extrap_train.data.module import with_warp
+from extrap_train.data.module import compute_warp
 from extrap_train.views import Camera, PairBatch, stack_cameras
 
 
@@ -32,7 +32,7 @@ def batch_of(count: int, size: int = 32, references: int = 3, seed: int = 0) -> 
         stack_cameras([camera_at(0.3 * (k + 1), size) for k in range(references)])
         for _ in range(count)
     ]
-    return with_warp(
+    return compute_warp(
         PairBatch(
             image=smooth(count, 3),
             camera=stack_cameras([camera_at(0.0, size)] * count),

@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 
 from extrap_train.config import ModelConfig
-from extrap_train.data.module import with_warp
+from extrap_train.data.module import compute_warp
 from extrap_train.diffusion.autoencoder import PixelPatches
 from extrap_train.diffusion.conditioning import (
     Conditioning,
@@ -50,7 +50,7 @@ def test_the_encoding_of_the_warp_points_at_the_reference_pixel(batch: PairBatch
     """Query and reference of the same pose: the warped coordinates are the reference's own grid."""
     alone = torch.tensor([[True, False, False]] * 3)
     same = replace(batch, camera=batch.reference_cameras[:, 0], reference_valid=alone, warp=None)
-    latents, _ = concatenated_latents(with_warp(same), PixelPatches(2), 2)
+    latents, _ = concatenated_latents(compute_warp(same), PixelPatches(2), 2)
     own, encoded = latents[:, 24:32], latents[:, 32:40]
     inside = (..., slice(2, -2), slice(2, -2))
     torch.testing.assert_close(encoded[inside], own[inside], atol=2e-2, rtol=0)

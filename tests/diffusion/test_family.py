@@ -7,7 +7,7 @@ import torch
 from batches import batch_of
 
 from extrap_train.config import ModelConfig, SamplerConfig
-from extrap_train.data.module import with_warp
+from extrap_train.data.module import compute_warp
 from extrap_train.diffusion.conditioning import filled_warp
 from extrap_train.diffusion.family import FAMILIES
 from extrap_train.diffusion.loss import diffusion_loss
@@ -57,7 +57,7 @@ def test_the_condition_keeps_its_precision_where_the_network_runs_in_less(
 def test_zeronvs_sees_the_nearest_reference_alone(config: ModelConfig, batch: PairBatch) -> None:
     others = batch.reference_images.clone()
     others[:, 1:] = 0.5
-    changed = with_warp(replace(batch, reference_images=others, warp=None))
+    changed = compute_warp(replace(batch, reference_images=others, warp=None))
     model = _model(config, "zeronvs")
     before, after = model.condition(batch), model.condition(changed)
     assert torch.equal(before.latents, after.latents)
@@ -75,7 +75,7 @@ def test_megascenes_is_told_the_warp_of_the_nearest_reference(
         reference_depths=torch.full_like(batch.reference_depths, 4.0),
         warp=None,
     )
-    latents = _model(config, "megascenes").condition(with_warp(same)).latents
+    latents = _model(config, "megascenes").condition(compute_warp(same)).latents
     photograph = torch.nn.functional.avg_pool2d(batch.reference_images[:, 0], 2) * 2 - 1
     inside = (..., slice(2, -2), slice(2, -2))
     torch.testing.assert_close(latents[:, -3:][inside], photograph[inside], atol=0.05, rtol=0)

@@ -8,7 +8,7 @@ import scenes
 import torch
 
 from extrap_train.config import CompletionConfig, ConfidenceConfig
-from extrap_train.data.module import with_warp
+from extrap_train.data.module import compute_warp
 from extrap_train.data.queries import query_batch
 from extrap_train.depth import RELIABLE_CONFIDENCE, DepthMap, PointMaps, point_maps_of
 from extrap_train.depth.dataset import DatasetDepth
@@ -54,7 +54,7 @@ class TracedGenerator:
         for i, name in enumerate(names):
             if name in self.wrong and (seed == 0 or self.stubborn):
                 images[i] = images[i].roll(MOVED, -1)
-        batch = with_warp(batch)
+        batch = compute_warp(batch)
         return GeneratedViews(torch.stack(images), batch.camera, batch.warp, chosen)
 
 

@@ -19,7 +19,7 @@ import torch
 from captures import write_capture
 from scenes import orbit_camera
 
-from data_prep.build import prepare
+from data_prep.preparation import prepare
 from extrap_train.config import LoraConfig, ModelConfig, PrepConfig, UNetConfig
 from extrap_train.data.co3d import read_category
 from extrap_train.data.prepared import PreparedData

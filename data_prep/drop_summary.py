@@ -1,4 +1,4 @@
-"""Why things were left out, summed up: what differs in numbers and files only is one reason."""
+"""Groups of the reasons for which sequences were dropped: numbers and paths do not matter."""
 
 import re
 from collections.abc import Iterable
@@ -10,8 +10,8 @@ _NUMBER = re.compile(r"[0-9]+([.,][0-9]+)*")
 
 
 @dataclass(frozen=True)
-class Kind:
-    """Reasons that have all but numbers and paths in common."""
+class ReasonGroup:
+    """Reasons that are the same but for numbers and paths."""
 
     count: int
     example: str
@@ -33,10 +33,10 @@ class Kind:
         return f"{times}, for instance {self.example}" if self.differ else f"{times} {self.example}"
 
 
-def kinds_of(reasons: Iterable[str]) -> list[Kind]:
-    """The kinds of reasons, the most frequent first."""
+def group_reasons(reasons: Iterable[str]) -> list[ReasonGroup]:
+    """Groups of equal reasons, the most frequent first."""
     members: dict[str, list[str]] = {}
     for reason in reasons:
         members.setdefault(_NUMBER.sub("#", _PATH.sub("/", reason)), []).append(reason)
-    kinds = [Kind(len(alike), alike[0], len({*alike}) > 1) for alike in members.values()]
-    return sorted(kinds, key=lambda kind: -kind.count)
+    groups = [ReasonGroup(len(same), same[0], len({*same}) > 1) for same in members.values()]
+    return sorted(groups, key=lambda group: -group.count)

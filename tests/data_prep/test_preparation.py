@@ -12,10 +12,10 @@ import torch
 from orbits import capture, even, ring, textured_capture
 
 from data_prep import pairs
-from data_prep.build import prepare
 from data_prep.frames import block_median, object_square
-from data_prep.tools import Tools
-from data_prep.unit import Unit, Workshop, prepare_unit
+from data_prep.model_cache import PrepModels
+from data_prep.preparation import prepare
+from data_prep.sequence_job import PrepContext, SequenceJob, prepare_sequence
 from extrap_train.config import FlowMatcherConfig, PrepConfig
 from extrap_train.data import frame_files
 from extrap_train.data.prepared import PreparedData
@@ -327,6 +327,6 @@ def test_no_memory_is_the_launchers_to_try_again_not_the_sequences_fault(
         def depth_maps(self, views: ListOf[View]) -> list[DepthMap]:
             raise error
 
-    shop = Workshop(Tools(Greedy(), None), OPTIONS, tmp_path, tmp_path)
+    shop = PrepContext(PrepModels(Greedy(), None), OPTIONS, tmp_path, tmp_path)
     with pytest.raises(MemoryError, match=re.escape(str(error))):
-        prepare_unit(Unit(shop, captures(1)[0], "train", "key"))
+        prepare_sequence(SequenceJob(shop, captures(1)[0], "train", "key"))

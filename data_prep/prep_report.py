@@ -1,27 +1,29 @@
-"""What was prepared, to look at: printed, and saved as a page with pictures."""
+"""Report of prepared data: a printed summary and a page with pictures."""
 
+import io
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
+import torch
 from jinja2 import Environment, Template
 from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
-from data_prep.reasons import kinds_of
-from data_prep.report_pairs import (
-    as_png,
-    correction_report,
-    pair_sheet,
-    share_corrected,
-)
+from data_prep.drop_summary import group_reasons
 from data_prep.split import held_out
-from extrap_train.data.prepared import Pairs, PreparedData
+from extrap_train.data.examples import collate, linspace_indices, read_example
+from extrap_train.data.prepared import UNTOUCHED, Pairs, PreparedData
 from extrap_train.geometry.viewpoints import fit_orbit
+from extrap_train.geometry.warp import warp_references
+from extrap_train.pictures import colour_depth, contact_sheet, error_map, mark_holes
 from extrap_train.store.atomic import write_atomic
 
+WORST = 20
+"""Pairs that the page shows for being furthest from the truth."""
 SAMPLES = 8
 """Pairs on the picture sheet, from the easiest to the hardest."""
 _LISTED = 200
@@ -70,7 +72,7 @@ def _reasons(dropped: pd.DataFrame) -> list[tuple[str, int]]:
     """What sequences were left out for, the most frequent first."""
     rows = zip(dropped["sequence"], dropped["reason"], strict=True)
     plain = (reason.removeprefix(f"sequence {name}: ") for name, reason in rows)
-    return [(kind.short, kind.count) for kind in kinds_of(plain)[:_REASONS]]
+    return [(kind.short, kind.count) for kind in group_reasons(plain)[:_REASONS]]
 
 
 def summary(data: PreparedData) -> dict[str, str]:
@@ -118,7 +120,7 @@ def histograms(data: PreparedData) -> Figure:
 def coverage(data: PreparedData) -> Figure:
     """Azimuths of the cameras around their orbits: a ring for each of at most 24 sequences."""
     kept = data.sequences[data.sequences["kept"]]
-    shown = kept.iloc[_evenly(len(kept), 24)]
+    shown = kept.iloc[linspace_indices(len(kept), 24)]
     figure = Figure(figsize=(5, 5), layout="constrained")
     axes = figure.add_subplot(projection="polar")
     for ring, (name, role) in enumerate(zip(shown["sequence"], shown["split"], strict=True)):
@@ -133,18 +135,109 @@ def coverage(data: PreparedData) -> Figure:
     return figure
 
 
-def _evenly(available: int, wanted: int) -> list[int]:
-    """At most `wanted` indices, evenly over those there are."""
-    return (
-        np.unique(np.linspace(0, available - 1, min(wanted, available)).round())
-        .astype(int)
-        .tolist()
-    )
-
-
 def _from_easy_to_hard(pairs: Pairs, count: int) -> list[int]:
     order = np.argsort(pairs.angle_rad, kind="stable")
-    return [int(order[place]) for place in _evenly(len(pairs), count)]
+    return [int(order[place]) for place in linspace_indices(len(pairs), count)]
+
+
+def correction_report(data: PreparedData, folder: Path) -> dict[str, Any]:
+    """What the page says of correction; draws its pictures into `folder`."""
+    if not data.is_corrected:
+        return {"corrections": {}, "worst": []}
+    pairs = data.pairs("train")
+    order = np.argsort(-np.nan_to_num(pairs.error_after, nan=-1.0), kind="stable")
+    worst = [int(index) for index in order[:WORST]]
+    write_atomic(folder / "correction.png", as_png(error_histogram(pairs)))
+    pair_sheet(data, worst, folder / "worst.png")
+    return {"corrections": correction_facts(data), "worst": [_row(data, pairs, i) for i in worst]}
+
+
+def share_corrected(data: PreparedData) -> str:
+    """How many training warps are moved."""
+    moved = data.pairs("train").flow != UNTOUCHED
+    return f"{int(moved.sum())} of {len(moved)}"
+
+
+def correction_facts(data: PreparedData) -> dict[str, str]:
+    """Gain and reasons, by what they are."""
+    pairs = data.pairs("train")
+    moved = pairs.flow != UNTOUCHED
+    facts = {"matcher": str(data.manifest["correction"]), "warps moved": share_corrected(data)}
+    if moved.any():
+        gain = 1 - pairs.error_after[moved] / pairs.error_before[moved]
+        low, middle, high = np.quantile(gain, (0.05, 0.5, 0.95))
+        facts["photometric error taken away"] = (
+            f"median {middle:.1%}, 5 % and 95 % quantiles {low:.1%} and {high:.1%}"
+        )
+    for group in group_reasons(pairs.uncorrected[~moved])[:6]:
+        facts[f"left alone because {group.short}"] = str(group.count)
+    return facts
+
+
+def error_histogram(pairs: Pairs) -> Figure:
+    """Photometric errors of the training warps, before and after; what does not fit is counted."""
+    figure = Figure(figsize=(9, 3.2), layout="constrained")
+    axes = figure.subplots()
+    known = np.isfinite(pairs.error_before)
+    top = float(np.quantile(pairs.error_before[known], 0.99)) if known.any() else 1.0
+    bins = np.linspace(0, max(top, 1e-6), 41)
+    for name, errors in (("before", pairs.error_before), ("after", pairs.error_after)):
+        beyond = int((errors[known] > bins[-1]).sum())
+        label = f"{name} ({beyond} beyond {bins[-1]:.3g})" if beyond else name
+        axes.hist(errors[known], bins.tolist(), alpha=0.6, label=label)
+    axes.set(xlabel="mean colour difference between warp and truth", ylabel="pairs")
+    axes.legend()
+    return figure
+
+
+def pair_sheet(data: PreparedData, chosen: list[int], path: Path) -> None:
+    """Training pairs, one per row: reference, depth, warp without and with flow, query, error.
+
+    The caption of a row gives its number, angle, sequence, reference and query.
+    """
+    pairs = data.pairs("train")
+    examples = [read_example(data, pairs[index], data.is_corrected) for index in chosen]
+    batch = collate(examples, references=1)
+    plain, moved = (
+        warp_references(
+            batch.reference_images,
+            batch.reference_depths,
+            batch.reference_cameras,
+            batch.reference_valid,
+            batch.camera,
+            flows,
+        )
+        for flows in (None, batch.reference_flows)
+    )
+    columns = {
+        "reference": batch.reference_images[:, 0],
+        "its depth": colour_depth(batch.reference_depths[:, 0]),
+        "warp (holes magenta)": mark_holes(plain.image, plain.mask),
+    }
+    if data.is_corrected:
+        columns["warp as trained on"] = mark_holes(moved.image, moved.mask)
+    columns["query"] = batch.image
+    shown = torch.where(moved.mask[:, None] > 0, moved.image, batch.image)
+    columns["error of the warp"] = error_map(shown, batch.image)
+    rows = [_row(data, pairs, index) for index in chosen]
+    captions = [
+        f"{number}: {row['angle']}, {row['sequence']}, {row['reference']} → {row['query']}"
+        for number, row in enumerate(rows, start=1)
+    ]
+    contact_sheet(columns, path, captions)
+
+
+def _row(data: PreparedData, pairs: Pairs, index: int) -> dict[str, Any]:
+    names = data.names(pairs.sequence[index])
+    return {
+        "sequence": pairs.sequence[index],
+        "reference": names[int(pairs.reference[index])],
+        "query": names[int(pairs.query[index])],
+        "angle": f"{np.degrees(pairs.angle_rad[index]):.0f}°",
+        "before": f"{pairs.error_before[index]:.4f}",
+        "after": f"{pairs.error_after[index]:.4f}",
+        "reason": pairs.uncorrected[index],
+    }
 
 
 def _print(facts: dict[str, str], reasons: list[tuple[str, int]], console: Console) -> None:
@@ -154,3 +247,10 @@ def _print(facts: dict[str, str], reasons: list[tuple[str, int]], console: Conso
     for reason, count in reasons[:5]:
         table.add_row(f"left out: {count}", reason)
     console.print(table, markup=False)
+
+
+def as_png(figure: Figure) -> bytes:
+    """The figure as a file's content."""
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=100)
+    return content.getvalue()

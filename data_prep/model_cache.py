@@ -1,7 +1,7 @@
-"""By what frames and corrections are made: options travel to jobs, networks stay where they run.
+"""Depth sources and matchers of jobs: their options are sent, every process builds them once.
 
-A network that is sent to another process takes a file descriptor a tensor along, and a job that
-waits keeps them: a few jobs of MASt3R's nine hundred tensors are more than a process may have open.
+A network that is sent to another process takes a file descriptor for each tensor, and a waiting job
+keeps them open: a few jobs with MASt3R's nine hundred tensors exceed a process's limit.
 """
 
 import os
@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 
@@ -29,15 +29,14 @@ from extrap_train.device import fastest_device
 from extrap_train.matching import Matcher
 from extrap_train.matching.build import matcher
 
-Options = TypeVar("Options")
-Tool = TypeVar("Tool")
+Model = TypeVar("Model")
 
 
 @dataclass(frozen=True)
-class Tools:
-    """A depth source and a matcher: options, from which every process makes its own, once.
+class PrepModels:
+    """A depth source and a matcher, as options or ready.
 
-    A ready one is used as it is, and goes along with every job: none that holds a network.
+    Ready ones are sent along with every job, so they must not hold a network.
     """
 
     depth: DepthConfig | DepthSource
@@ -55,22 +54,23 @@ class Tools:
         return "" if self.correction is None else _identity(self.correction)
 
     def depth_source(self) -> DepthSource:
-        """On the GPU of this process, where it has one."""
-        return (
-            _made(depth_source, self.depth) if isinstance(self.depth, DepthConfig) else self.depth
-        )
+        """This process's depth source, on its GPU where it has one."""
+        if isinstance(self.depth, DepthConfig):
+            return _build_cached(depth_source, pickle.dumps(self.depth))
+        return self.depth
 
     def matcher(self) -> Matcher | None:
-        """On the GPU of this process, where it has one."""
-        how = self.correction
-        return _made(matcher, how) if isinstance(how, MatcherConfig) else how
+        """This process's matcher, on its GPU where it has one."""
+        if isinstance(self.correction, MatcherConfig):
+            return _build_cached(matcher, pickle.dumps(self.correction))
+        return self.correction
 
     def default_workers(self) -> int:
-        """One where a network runs on a GPU, whose memory every process would fill with another;
-        else one a core."""
+        """One where a network runs on a GPU, whose memory more processes would overfill; else one
+        per core."""
         networks = (Mast3rConfig, MonocularConfig, LoftrMatcherConfig, AlikedMatcherConfig)
         on_gpu = fastest_device().type == "cuda"
-        if on_gpu and any(isinstance(tool, networks) for tool in (self.depth, self.correction)):
+        if on_gpu and any(isinstance(model, networks) for model in (self.depth, self.correction)):
             return 1
         return len(os.sched_getaffinity(0))
 
@@ -83,34 +83,30 @@ class Tools:
             matcher(self.correction, device=cpu)
 
 
-def _identity(tool: object) -> str:
-    return f"{tool!r} {[file_stamp(file) for file in weight_files(tool)]}"
+def _identity(model: object) -> str:
+    return f"{model!r} {[file_stamp(file) for file in weight_files(model)]}"
 
 
-def weight_files(tool: object) -> list[Path]:
+def weight_files(model: object) -> list[Path]:
     """The files of weights that a depth source or a matcher reads."""
-    match tool:
+    match model:
         case Mast3rConfig() | LoftrMatcherConfig() | AlikedMatcherConfig():
-            return [Path(tool.checkpoint or "")]
+            return [Path(model.checkpoint or "")]
         case MonocularConfig():
             # transformers takes seconds to load: only where it is wanted.
             from extrap_train.depth.depth_anything import files_read
 
-            return [*files_read(tool.model), *weight_files(tool.matcher)]
+            return [*files_read(model.model), *weight_files(model.matcher)]
         case _:
             return []
 
 
-def put_away() -> None:
-    """Let go of what this process has made: training wants the memory."""
-    _made_once.cache_clear()
-
-
-def _made(make: Callable[[Options], Tool], options: Options) -> Tool:
-    return _made_once(make, pickle.dumps(options))
+def release_models() -> None:
+    """Free this process's depth source and matcher: training needs the memory."""
+    _build_cached.cache_clear()
 
 
 @lru_cache(maxsize=2)
-def _made_once(make: Callable[[Options], Tool], options: bytes) -> Tool:
-    """By the options' bytes, because options can be changed and so cannot be looked up."""
-    return make(pickle.loads(options))
+def _build_cached(build: Callable[[Any], Model], options: bytes) -> Model:
+    """Cached by the options' bytes: options are mutable and have no hash."""
+    return build(pickle.loads(options))

@@ -8,10 +8,15 @@ from orbits import capture, even, ring, textured_capture
 from PIL import Image
 from rich.console import Console
 
-from data_prep import report_pairs
-from data_prep.build import prepare
-from data_prep.report import coverage, write_report
-from data_prep.report_pairs import correction_facts, error_histogram, pair_sheet
+from data_prep import prep_report
+from data_prep.prep_report import (
+    correction_facts,
+    coverage,
+    error_histogram,
+    pair_sheet,
+    write_report,
+)
+from data_prep.preparation import prepare
 from extrap_train.config import FlowMatcherConfig, PrepConfig
 from extrap_train.data.prepared import Pairs, PreparedData
 from extrap_train.depth.dataset import DatasetDepth
@@ -69,7 +74,7 @@ def test_the_rows_of_a_sheet_say_which_pairs_they_show(
 ) -> None:
     said: list[str] = []
     monkeypatch.setattr(
-        report_pairs, "contact_sheet", lambda columns, path, captions: said.extend(captions)
+        prep_report, "contact_sheet", lambda columns, path, captions: said.extend(captions)
     )
     pair_sheet(data, [5, 2], tmp_path / "sheet.png")
     pairs = data.pairs("train")

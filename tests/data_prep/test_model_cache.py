@@ -1,7 +1,7 @@
 """Networks are made where they run: what a job takes along is small and holds nothing open.
 
-`python -m pytest -m slow tests/data_prep/test_tools.py` prepares with a network in two processes
-that may have few files open.
+`python -m pytest -m slow tests/data_prep/test_model_cache.py` prepares with a network in two
+processes that may have few files open.
 """
 
 import argparse
@@ -17,8 +17,8 @@ import torch
 from captures import write_capture
 from kornia.feature import LoFTR
 
-from data_prep.tools import Tools, put_away
-from data_prep.unit import Unit, Workshop
+from data_prep.model_cache import PrepModels, release_models
+from data_prep.sequence_job import PrepContext, SequenceJob
 from extrap_train.config import (
     FlowMatcherConfig,
     LoftrMatcherConfig,
@@ -53,24 +53,24 @@ def mast3r(tmp_path_factory: pytest.TempPathFactory) -> Mast3rConfig:
 
 
 def test_a_job_is_small_and_keeps_no_file_open(mast3r: Mast3rConfig, tmp_path: Path) -> None:
-    tools = Tools(mast3r, LoftrMatcherConfig(checkpoint="loftr.ckpt"))
-    shop = Workshop(tools, PrepConfig(), tmp_path, tmp_path)
+    tools = PrepModels(mast3r, LoftrMatcherConfig(checkpoint="loftr.ckpt"))
+    shop = PrepContext(tools, PrepConfig(), tmp_path, tmp_path)
     before = open_files()
-    job = ForkingPickler.dumps(Unit(shop, Sequence("cup", "one", ()), "train", "key"))
+    job = ForkingPickler.dumps(SequenceJob(shop, Sequence("cup", "one", ()), "train", "key"))
     assert open_files() == before
     assert len(job) < 2000
 
 
 def test_a_process_makes_its_tools_once_and_can_let_go_of_them(mast3r: Mast3rConfig) -> None:
-    tools = Tools(mast3r, None)
+    tools = PrepModels(mast3r, None)
     first = tools.depth_source()
     assert pickle.loads(pickle.dumps(tools)).depth_source() is first
     assert tools.matcher() is None
-    put_away()
+    release_models()
     assert tools.depth_source() is not first
-    put_away()
+    release_models()
     ready = DatasetDepth()
-    assert Tools(ready, None).depth_source() is ready
+    assert PrepModels(ready, None).depth_source() is ready
 
 
 def test_weights_that_cannot_be_used_are_refused_before_anything_is_rendered(
@@ -118,20 +118,20 @@ def test_two_processes_with_a_network_need_few_open_files(tmp_path: Path) -> Non
 def test_other_weights_under_the_same_name_are_other_tools(tmp_path: Path) -> None:
     weights, options = tmp_path / "loftr.ckpt", LoftrMatcherConfig()
     options.checkpoint = str(weights)
-    absent = Tools(DatasetDepth(), options).correction_identity
+    absent = PrepModels(DatasetDepth(), options).correction_identity
     weights.write_bytes(b"some")
-    first = Tools(DatasetDepth(), options).correction_identity
+    first = PrepModels(DatasetDepth(), options).correction_identity
     weights.write_bytes(b"others")
-    assert len({absent, first, Tools(DatasetDepth(), options).correction_identity}) == 3
-    assert Tools(DatasetDepth(), None).correction_identity == ""
+    assert len({absent, first, PrepModels(DatasetDepth(), options).correction_identity}) == 3
+    assert PrepModels(DatasetDepth(), None).correction_identity == ""
 
 
 def test_processes_do_not_share_a_gpu_that_holds_a_network(
     mast3r: Mast3rConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("os.sched_getaffinity", lambda _: range(8))
-    networks = Tools(mast3r, None), Tools(DatasetDepth(), LoftrMatcherConfig())
+    networks = PrepModels(mast3r, None), PrepModels(DatasetDepth(), LoftrMatcherConfig())
     assert [tools.default_workers() for tools in networks] == [8, 8]
     monkeypatch.setattr("torch.cuda.is_available", lambda: True)
     assert [tools.default_workers() for tools in networks] == [1, 1]
-    assert Tools(DatasetDepth(), FlowMatcherConfig()).default_workers() == 8
+    assert PrepModels(DatasetDepth(), FlowMatcherConfig()).default_workers() == 8

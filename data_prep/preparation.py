@@ -1,4 +1,4 @@
-"""Preparation of a category: filter, split, every sequence as a unit of its own, tables."""
+"""Preparation of a category: filter, split, one job per sequence, tables."""
 
 import hashlib
 import json
@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from data_prep.correct import METHOD as CORRECTION_METHOD
+from data_prep.drop_summary import group_reasons
 from data_prep.filter import judge_all
 from data_prep.frames import METHOD, CaptureKeys, too_many_unusable
-from data_prep.reasons import kinds_of
+from data_prep.model_cache import PrepModels, release_models
+from data_prep.sequence_job import NO_SPACE, PrepContext, SequenceJob, prepare_sequence
 from data_prep.split import Split, split_sequences
 from data_prep.tables import Outcome, write_results
-from data_prep.tools import Tools, put_away
-from data_prep.unit import NO_SPACE, Unit, Workshop, prepare_unit
 from extrap_train.config import DepthConfig, MatcherConfig, PrepConfig
 from extrap_train.data.prepared import FORMAT, PreparedData
 from extrap_train.data.sequences import Sequence
@@ -31,7 +31,7 @@ from extrap_train.terminal import track
 
 LOG = logging.getLogger(__name__)
 HERE = LocalLauncher(1)
-"""Runs units one after the other in this process."""
+"""Runs jobs one after the other in this process."""
 _BYTES_PER_PIXEL = 3 + 2 + 1
 """Of a stored frame: colours, depth, mask."""
 
@@ -42,20 +42,24 @@ class _Plan:
 
     sequences: ListOf[Sequence]
     capture_keys: ListOf[str]
-    workshop: Workshop
+    context: PrepContext
     test_names: Collection[str] | int
     key: str
     """A hash of options and captures: the same on every machine."""
 
     @classmethod
     def of(
-        cls, sequences: ListOf[Sequence], shop: Workshop, test_names: Collection[str] | int
+        cls,
+        sequences: ListOf[Sequence],
+        context: PrepContext,
+        test_names: Collection[str] | int,
     ) -> "_Plan":
         """Looks at the files of every capture, once."""
+        models, options = context.models, context.options
         test = test_names if isinstance(test_names, int) else sorted(test_names)
-        how = [asdict(shop.options), test, repr(shop.tools), METHOD, CORRECTION_METHOD]
-        digest = hashlib.sha256(json.dumps([FORMAT, *how]).encode())
-        depth, size = shop.tools.depth_identity, shop.options.image_size
+        settings = [FORMAT, asdict(options), test, repr(models), METHOD, CORRECTION_METHOD]
+        digest = hashlib.sha256(json.dumps(settings).encode())
+        depth, size = models.depth_identity, options.image_size
         capture_keys = []
         for sequence in sequences:
             keys = CaptureKeys.of(sequence)
@@ -64,12 +68,12 @@ class _Plan:
             traits = [sequence.category, sequence.name, qualities, keys.content, keys.sizes]
             lost = [len(sequence.left_out)] if sequence.left_out else []
             digest.update(json.dumps([*traits, *lost]).encode())
-        return cls(sequences, capture_keys, shop, test_names, digest.hexdigest())
+        return cls(sequences, capture_keys, context, test_names, digest.hexdigest())
 
     @property
     def keys(self) -> dict[str, str]:
         """What the manifest says: `key`, and `files` of the very files that were read."""
-        files = json.dumps([*self.capture_keys, self.workshop.correction])
+        files = json.dumps([*self.capture_keys, self.context.correction])
         return {"key": self.key, "files": hashlib.sha256(files.encode()).hexdigest()}
 
 
@@ -92,14 +96,16 @@ def prepare(
 
     `frames` and `pairs` are the folders of each sequence's frames and pairs, which calls with other
     options may share; the same as `folder` by default. Training warps are corrected where there is
-    a `matcher`. Options of both are made to tools where the jobs run; ready tools go along with the
-    jobs. A sequence that cannot be used is dropped with its reason, and tried again by the next
-    call unless `retry` is False. Finished sequences are kept whatever ends the call. The manifest
-    repeats `source`, what the captures came from. Raises InputError where no sequence is left, or
-    the disk is full.
+    a `matcher`. Options of both are built where the jobs run; ready ones are sent with the jobs.
+
+    A sequence that cannot be used is dropped with its reason, and tried again by the next call
+    unless `retry` is False. Finished sequences are kept whatever ends the call. The manifest holds
+    `source`, what the captures came from. Raises InputError where no sequence is left, or the disk
+    is full.
     """
-    shop = Workshop(Tools(depth, matcher), options, frames or folder, pairs or folder)
-    plan = _Plan.of(sequences, shop, test_names)
+    models = PrepModels(depth, matcher)
+    context = PrepContext(models, options, frames or folder, pairs or folder)
+    plan = _Plan.of(sequences, context, test_names)
     if _is_finished(plan, folder, retry):
         print(f"{folder}: prepared already, used as it is")
         return PreparedData.open(folder)
@@ -107,15 +113,15 @@ def prepare(
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "manifest.json").unlink(missing_ok=True)
         outcomes, split = _make_all(plan, launcher, progress)
-        for place in (folder, *shop.frames.glob("*/*"), *shop.pairs.glob("*/*")):
+        for place in (folder, *context.frames_root.glob("*/*"), *context.pairs_root.glob("*/*")):
             remove_leftovers(place)
-        write_results(folder, shop, outcomes, split, {**plan.keys, "data": source})
+        write_results(folder, context, outcomes, split, {**plan.keys, "data": source})
     except OSError as error:
         if error.errno not in NO_SPACE:
             raise
         raise InputError(_disk_full(folder, sequences, options)) from None
     finally:
-        put_away()
+        release_models()
     return PreparedData.open(folder)
 
 
@@ -135,7 +141,7 @@ def _is_finished(plan: _Plan, folder: Path, retry: bool) -> bool:
     if failed and retry:
         LOG.warning("%s: %d sequences failed before and are tried again", folder, failed)
         return False
-    damaged = [unit.name for unit in _units_of(plan, data) if not unit.is_there]
+    damaged = [job.name for job in _finished_jobs(plan, data) if not job.is_there]
     if damaged:
         LOG.warning(
             "%s: frames or pairs of %d sequences (first: %s) are damaged, gone or replaced: "
@@ -147,11 +153,11 @@ def _is_finished(plan: _Plan, folder: Path, retry: bool) -> bool:
     return not damaged
 
 
-def _units_of(plan: _Plan, data: PreparedData) -> Iterator[Unit]:
+def _finished_jobs(plan: _Plan, data: PreparedData) -> Iterator[SequenceJob]:
     for sequence, key in zip(plan.sequences, plan.capture_keys, strict=True):
         role = data.roles.get(f"{sequence.category}/{sequence.name}")
         if role:
-            yield Unit(plan.workshop, sequence, role, key)
+            yield SequenceJob(plan.context, sequence, role, key)
 
 
 def _make_all(plan: _Plan, launcher: Launcher, progress: bool) -> tuple[list[Outcome], Split]:
@@ -160,7 +166,7 @@ def _make_all(plan: _Plan, launcher: Launcher, progress: bool) -> tuple[list[Out
     Who is tested on depends on who is left, so after failures the split is made anew, and what it
     gives another role is made again.
     """
-    verdicts = judge_all(plan.sequences, plan.workshop.options)
+    verdicts = judge_all(plan.sequences, plan.context.options)
     outcomes = [
         Outcome(sequence, verdict, failed=False, capture_key=key)
         for sequence, verdict, key in zip(plan.sequences, verdicts, plan.capture_keys, strict=True)
@@ -172,9 +178,9 @@ def _make_all(plan: _Plan, launcher: Launcher, progress: bool) -> tuple[list[Out
             raise InputError(_nothing_left(outcomes))
         split = split_sequences(list(kept), plan.test_names)
         roles = {name: split.role(name) for name in kept}
-        units = [
-            Unit(
-                plan.workshop,
+        jobs = [
+            SequenceJob(
+                plan.context,
                 outcomes[number].sequence,
                 roles[name],
                 outcomes[number].capture_key,
@@ -183,14 +189,14 @@ def _make_all(plan: _Plan, launcher: Launcher, progress: bool) -> tuple[list[Out
             for name, number in kept.items()
             if made.get(name) != roles[name]
         ]
-        if not units:
+        if not jobs:
             return outcomes, split
-        done = launcher.run(prepare_unit, units)
-        for index, reason in track(done, "preparing", len(units), "sequences", shown=progress):
-            unit = units[index]
-            made[unit.name] = unit.role
+        done = launcher.run(prepare_sequence, jobs)
+        for index, reason in track(done, "preparing", len(jobs), "sequences", shown=progress):
+            job = jobs[index]
+            made[job.name] = job.role
             if reason:
-                number = kept[unit.name]
+                number = kept[job.name]
                 outcomes[number] = _left_out(outcomes[number], reason)
 
 
@@ -206,8 +212,8 @@ def _left_out(outcome: Outcome, reason: str | Died) -> Outcome:
 def _nothing_left(outcomes: list[Outcome]) -> str:
     if not outcomes:
         return "no sequence to prepare; check the category and the data set's root"
-    kinds = kinds_of(o.verdict.reason.removeprefix(f"sequence {o.name}: ") for o in outcomes)
-    listed = "; ".join(kind.counted for kind in kinds[:3])
+    groups = group_reasons(o.verdict.reason.removeprefix(f"sequence {o.name}: ") for o in outcomes)
+    listed = "; ".join(group.counted for group in groups[:3])
     remedies = ["add sequences"]
     damaged = [_is_damaged(outcome) for outcome in outcomes]
     if not all(damaged):
