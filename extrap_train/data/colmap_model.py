@@ -1,8 +1,4 @@
-"""COLMAP's sparse models, text and binary: cameras and images; points in space are not needed.
-
-Read here and not by pycolmap, which trusts the counts that a file states: the files may come from
-anywhere, and only cameras and poses are needed of them.
-"""
+"""COLMAP's sparse models as captures."""
 
 import logging
 from functools import partial
@@ -11,19 +7,25 @@ from pathlib import Path
 import torch
 
 from extrap_train.data.camera_check import COLMAP_POSES
-from extrap_train.data.colmap_binary import (
-    count_binary_images,
-    read_binary_cameras,
-    read_binary_images,
+from extrap_train.data.colmap_files import (
+    ModelCamera,
+    ModelImage,
+    read_model_cameras,
+    read_model_images,
 )
-from extrap_train.data.colmap_records import ModelCamera, ModelImage
-from extrap_train.data.colmap_text import count_text_images, read_text_cameras, read_text_images
 from extrap_train.data.listed_files import ListedFiles
 from extrap_train.data.paths import check_relative
 from extrap_train.data.photographs import Listed, Photograph, sequence_of_photographs
+from extrap_train.data.picture_files import MAX_PIXELS
 from extrap_train.data.sequences import PointCloud, Sequence
 from extrap_train.errors import InputError
-from extrap_train.geometry.colmap import world_to_cam_from_colmap
+from extrap_train.geometry.colmap import (
+    CAMERA_MODELS,
+    OTHER_MODELS,
+    lens_from_parameters,
+    world_to_cam_from_colmap,
+)
+from extrap_train.geometry.lens import Lens
 
 POINT_CLOUD = "points3D.ply"
 """Some tools leave one beside the model."""
@@ -73,10 +75,7 @@ def read_model(model: Path, images: Path, name: str) -> Sequence:
     for file in (cameras_file, images_file):
         if not file.is_file():
             raise InputError(f"{file}: no such file; export the whole COLMAP model")
-    if images_file.suffix == ".bin":
-        cameras, entries = read_binary_cameras(cameras_file), read_binary_images(images_file)
-    else:
-        cameras, entries = read_text_cameras(cameras_file), read_text_images(images_file)
+    cameras, entries = read_model_cameras(cameras_file), read_model_images(images_file)
     if not entries:
         raise InputError(f"{images_file}: lists no picture; run COLMAP again")
     by_number = _by_number(cameras, cameras_file)
@@ -100,10 +99,12 @@ def _images_file(folder: Path) -> Path | None:
 
 
 def _count_images(model: Path) -> int:
+    """0 where the file that lists them is damaged."""
     file = _images_file(model)
-    if file is None:
+    try:
+        return len(read_model_images(file)) if file else 0
+    except InputError:
         return 0
-    return count_binary_images(file) if file.suffix == ".bin" else count_text_images(file)
 
 
 def _by_number(cameras: list[ModelCamera], file: Path) -> dict[int, ModelCamera]:
@@ -130,6 +131,30 @@ def _photograph(
         image_path=path,
         height=camera.height,
         width=camera.width,
-        lens=camera.lens(file),
+        lens=_lens(camera, file),
         world_to_cam=world_to_cam_from_colmap(quaternion, translation),
     )
+
+
+def _lens(camera: ModelCamera, file: Path) -> Lens:
+    """InputError where the model cannot be undone or the entry makes no sense."""
+    known = (m for m in CAMERA_MODELS if camera.model in (m.name, m.number))
+    model = next(known, None)
+    if model is None:
+        name = camera.model
+        if isinstance(name, int) and name in OTHER_MODELS:
+            name = OTHER_MODELS[name][0]
+        raise InputError(
+            f"{file}: camera {camera.number} is of the model {name}, and only "
+            f"{', '.join(m.name for m in CAMERA_MODELS)} can be undone; run COLMAP's "
+            "image_undistorter first"
+        )
+    count, height, width = len(camera.parameters), camera.height, camera.width
+    sized = height > 0 and width > 0 and height * width <= MAX_PIXELS
+    if count != len(model.parameters) or not sized:
+        raise InputError(
+            f"{file}: camera {camera.number} ({model.name}) has {count} parameters and size "
+            f"{height} x {width}, expected {len(model.parameters)} of them; export the model again"
+        )
+    named = dict(zip(model.parameters, camera.parameters, strict=True))
+    return lens_from_parameters(named, model.fisheye)

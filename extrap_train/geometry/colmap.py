@@ -53,6 +53,10 @@ OTHER_MODELS = {
     17: ("EQUIRECTANGULAR", 2),
 }
 """COLMAP's other models by number: name and how many parameters. None of these can be undone."""
+PARAMETER_COUNTS = {model.number: len(model.parameters) for model in CAMERA_MODELS} | {
+    number: count for number, (_, count) in OTHER_MODELS.items()
+}
+"""How many parameters a camera has, by the number of its model."""
 
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE_COEFFICIENTS = ("k1", "k2", "k3", "k4")

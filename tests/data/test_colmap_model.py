@@ -10,8 +10,8 @@ from captures import view_at
 from PIL import Image
 from two_views import epipolar_distances
 
+from extrap_train.data.colmap_files import read_model_images
 from extrap_train.data.colmap_model import find_model, read_model
-from extrap_train.data.colmap_text import read_text_images
 from extrap_train.errors import InputError
 from extrap_train.geometry.colmap import colmap_from_world_to_cam
 from extrap_train.views import Camera
@@ -347,4 +347,4 @@ def test_images_without_lines_of_points_are_not_lost(tmp_path):
     images = [line for line in file.read_text().splitlines() if line.endswith(".png")]
     file.write_text("\n".join(images) + "\n")
     with pytest.raises(InputError, match=r"line 2 is an image where the points .* export"):
-        read_text_images(file)
+        read_model_images(file)

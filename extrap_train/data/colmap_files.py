@@ -1,0 +1,195 @@
+"""COLMAP's `cameras` and `images` files, text and binary: cameras and poses, without the points.
+
+Read here and not by pycolmap, which trusts the counts that a file states and hangs on damaged ones.
+"""
+
+import mmap
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from extrap_train.data.paths import MAX_PATH_BYTES
+from extrap_train.errors import InputError
+from extrap_train.geometry.colmap import PARAMETER_COUNTS
+
+_MAX_LINE_CHARACTERS = 2**24
+"""A line of points takes about twenty for each."""
+_POINT_2D_BYTES = 24
+"""x, y and the number of the point in space, 8 bytes each."""
+
+
+@dataclass(frozen=True)
+class ModelCamera:
+    """A camera of a model, of any of COLMAP's camera models."""
+
+    number: int
+    model: str | int
+    """Its name, or its number as a binary file has it."""
+    height: int
+    width: int
+    parameters: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class ModelImage:
+    """A posed picture of a model."""
+
+    name: str
+    camera: int
+    quaternion_wxyz: tuple[float, ...]
+    translation: tuple[float, ...]
+
+
+def read_model_cameras(file: Path) -> list[ModelCamera]:
+    """Every camera of a `cameras.bin` or `cameras.txt`."""
+    return _binary_cameras(file) if file.suffix == ".bin" else _text_cameras(file)
+
+
+def read_model_images(file: Path) -> list[ModelImage]:
+    """Every image of an `images.bin` or `images.txt`."""
+    return _binary_images(file) if file.suffix == ".bin" else _text_images(file)
+
+
+class _Cursor:
+    """Walks through the little-endian values of a file; struct.error past its end."""
+
+    def __init__(self, content: mmap.mmap) -> None:
+        self.content, self.at = content, 0
+
+    def read(self, layout: str) -> tuple[Any, ...]:
+        values = struct.unpack_from(f"<{layout}", self.content, self.at)
+        self.at += struct.calcsize(f"<{layout}")
+        return values
+
+    def read_name(self) -> str:
+        end = self.content.find(b"\0", self.at, self.at + MAX_PATH_BYTES + 1)
+        if end < 0:
+            raise struct.error("a name has no end")
+        name = self.content[self.at : end].decode()
+        self.at = end + 1
+        return name
+
+
+@contextmanager
+def _cursor(file: Path) -> Iterator[_Cursor]:
+    try:
+        with (
+            file.open("rb") as stream,
+            mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content,
+        ):
+            cursor = _Cursor(content)
+            yield cursor
+            if cursor.at > len(content):
+                raise struct.error("the last image's points are missing")
+    except InputError:
+        raise
+    except UnicodeDecodeError:
+        raise InputError(
+            f"{file}: has a picture name that is not UTF-8; export the model again"
+        ) from None
+    except (struct.error, ValueError, OverflowError):  # ValueError: an empty file
+        raise InputError(f"{file}: is truncated or damaged; export the model again") from None
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({error.strerror}); check the file") from None
+
+
+def _binary_cameras(file: Path) -> list[ModelCamera]:
+    cameras = []
+    with _cursor(file) as cursor:
+        for _ in range(*cursor.read("Q")):
+            number, model, width, height = cursor.read("iiQQ")
+            if model not in PARAMETER_COUNTS:
+                raise InputError(
+                    f"{file}: camera {number} is of a model that has the number {model}, and the "
+                    f"models known here end at {max(PARAMETER_COUNTS)}; run COLMAP's "
+                    "image_undistorter first"
+                )
+            parameters = cursor.read(f"{PARAMETER_COUNTS[model]}d")
+            cameras.append(ModelCamera(number, model, height, width, parameters))
+    return cameras
+
+
+def _binary_images(file: Path) -> list[ModelImage]:
+    images = []
+    with _cursor(file) as cursor:
+        for _ in range(*cursor.read("Q")):
+            _number, *pose, camera = cursor.read("i7di")
+            images.append(ModelImage(cursor.read_name(), camera, tuple(pose[:4]), tuple(pose[4:])))
+            (points,) = cursor.read("Q")
+            cursor.at += points * _POINT_2D_BYTES
+    return images
+
+
+def _text_cameras(file: Path) -> list[ModelCamera]:
+    """`CAMERA_ID MODEL WIDTH HEIGHT PARAMS…` on each line."""
+    cameras = []
+    for number, line in _lines(file):
+        if not line.strip():
+            continue
+        try:
+            identity, model, width, height, *parameters = line.split()
+            numbers = tuple(map(float, parameters))
+            cameras.append(ModelCamera(int(identity), model, int(height), int(width), numbers))
+        except ValueError:
+            raise _malformed(file, number) from None
+    return cameras
+
+
+def _text_images(file: Path) -> list[ModelImage]:
+    """`ID QW QX QY QZ TX TY TZ CAMERA_ID NAME` on one line, on the next its points or nothing."""
+    images: list[ModelImage] = []
+    is_image, blank_at = True, 0
+    for number, line in _lines(file):
+        fields = line.split(maxsplit=9)  # a name may hold spaces
+        if not is_image and len(fields) == 10 and not _is_number(fields[9].split()[0]):
+            raise InputError(
+                f"{file}: line {number} is an image where the points of the one before are "
+                "expected, on a line that may be empty; export the model again"
+            )
+        if not is_image:
+            is_image = True
+        elif not fields:  # allowed before the first image and after the last
+            blank_at = number if images else 0
+        elif blank_at:
+            raise _malformed(file, blank_at)
+        else:
+            try:
+                pose = tuple(map(float, fields[1:8]))
+                images.append(ModelImage(fields[9].strip(), int(fields[8]), pose[:4], pose[4:]))
+            except (IndexError, ValueError):
+                raise _malformed(file, number) from None
+            is_image = False
+    return images
+
+
+def _is_number(word: str) -> bool:
+    """Points are triples of numbers, so their tenth word is a number; an image's is its name."""
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _lines(file: Path) -> Iterator[tuple[int, str]]:
+    """Numbered lines without the comments, one at a time."""
+    number = 0
+    try:
+        with file.open(encoding="utf-8-sig") as stream:
+            while line := stream.readline(_MAX_LINE_CHARACTERS):
+                number += 1
+                if len(line) == _MAX_LINE_CHARACTERS:
+                    raise InputError(f"{file}: line {number} has no end; export the model again")
+                if not line.startswith("#"):
+                    yield number, line
+    except UnicodeDecodeError:
+        raise InputError(f"{file}: is no UTF-8 text; export the model again") from None
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({error.strerror}); check the file") from None
+
+
+def _malformed(file: Path, number: int) -> InputError:
+    return InputError(f"{file}: line {number} is malformed; export the model again")
