@@ -9,9 +9,9 @@ from typing import Any
 import torch
 
 from extrap_train.config import SyntheticConfig
-from extrap_train.data.annotations import read_sequence_annotations
 from extrap_train.data.co3d import FRAME_ANNOTATIONS, SEQUENCE_ANNOTATIONS
-from extrap_train.data.co3d_writer import write_annotations, write_frame, write_sequence
+from extrap_train.data.co3d.annotations import read_sequence_annotations
+from extrap_train.data.co3d.writer import write_annotations, write_frame, write_sequence
 from extrap_train.data.synthetic import (
     build_scene,
     handheld_orbit,

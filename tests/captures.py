@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from scenes import Scene, orbit_camera, plane, sphere
 
-from extrap_train.data.co3d_writer import write_annotations, write_frame, write_sequence
+from extrap_train.data.co3d.writer import write_annotations, write_frame, write_sequence
 from extrap_train.views import View
 
 SCENE = Scene((sphere(0.8), plane(0.9, (0.0, 1.0, 0.0))))

@@ -13,15 +13,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrap_train.data.camera_check import PoseConvention, find_pose_fault
-from extrap_train.data.images import read_depth, read_photograph
 from extrap_train.data.listed_files import PICTURE_SUFFIXES, ListedFiles
-from extrap_train.data.paths import require_file
+from extrap_train.data.photograph_loader import DepthFile, PhotographLoader
 from extrap_train.data.picture_files import image_size, same_view
 from extrap_train.data.sequences import Frame, PointCloud, Sequence
 from extrap_train.data.validation import require_sound
 from extrap_train.errors import InputError
-from extrap_train.geometry.lens import Lens, undistort
-from extrap_train.views import Camera, View, stack_cameras, stack_poses
+from extrap_train.geometry.lens import Lens
+from extrap_train.views import Camera, stack_cameras, stack_poses
 
 CATEGORY = "scene"
 """What stands for a category where a capture has none."""
@@ -40,9 +39,7 @@ class Photograph:
     width: int
     lens: Lens
     world_to_cam: Float[Tensor, "4 4"]
-    depth_path: str | None = None
-    depth_scale: float = 1.0
-    """Scene units per unit of the depth file."""
+    depth: DepthFile | None = None
     mask_path: str | None = None
 
 
@@ -55,45 +52,6 @@ class Listed:
     describe: Callable[[str], Photograph]
     """The photograph, by the path at which the picture was found; InputError where the entry cannot
     be used."""
-
-
-@dataclass(frozen=True)
-class _Loader:
-    """Reads one photograph and undoes its lens; a dataclass, so that workers can be sent it."""
-
-    root: Path
-    photograph: Photograph
-    pinhole: Lens
-    camera: Camera
-    name: str
-
-    @property
-    def files(self) -> tuple[Path, ...]:
-        photo = self.photograph
-        paths = (photo.image_path, photo.mask_path, photo.depth_path)
-        return tuple(self.root / path for path in paths if path)
-
-    def load(self, *, depth: bool = True) -> View:
-        photo, size = self.photograph, (self.camera.height, self.camera.width)
-        image_path = require_file(self.root / photo.image_path)
-        mask_path = require_file(self.root / photo.mask_path) if photo.mask_path else None
-        image, mask = read_photograph(image_path, size, mask_path)
-        far = None
-        if depth and photo.depth_path:
-            far = read_depth(require_file(self.root / photo.depth_path), size, photo.depth_scale)
-        return View(
-            image=self._straight(image.permute(1, 2, 0)).permute(2, 0, 1).contiguous(),
-            camera=self.camera,
-            depth=None if far is None else self._straight(far, nearest=True),
-            mask=None if mask is None else self._straight(mask),
-            name=self.name,
-        )
-
-    def _straight(self, picture: Tensor, nearest: bool = False) -> Tensor:
-        lens = self.photograph.lens
-        if lens.is_pinhole:
-            return picture
-        return torch.from_numpy(undistort(picture.numpy(), lens, self.pinhole, nearest))
 
 
 def sequence_of_photographs(
@@ -210,16 +168,16 @@ def _at_its_size(root: Path, photo: Photograph) -> Photograph:
 
 def _frame(root: Path, photo: Photograph, name: str, description: Path) -> Frame:
     pinhole, camera = pinhole_camera(photo, description)
-    loader = _Loader(root, photo, pinhole, camera, name)
-    return Frame(
+    return PhotographLoader(
+        root=root,
         name=name,
         camera=camera,
-        has_depth=photo.depth_path is not None,
-        has_mask=photo.mask_path is not None,
-        load=loader.load,
-        files=loader.files,
-        reading=f"{photo.lens}, depth in {photo.depth_scale}",
-    )
+        image_path=photo.image_path,
+        mask_path=photo.mask_path,
+        depth=photo.depth,
+        lens=None if photo.lens.is_pinhole else photo.lens,
+        pinhole=pinhole,
+    ).frame()
 
 
 def pinhole_camera(photo: Photograph, description: Path) -> tuple[Lens, Camera]:

@@ -13,6 +13,7 @@ from extrap_train.data.json_files import read_json
 from extrap_train.data.lens_keys import LENS_KEYS, lens_of, merged_entry
 from extrap_train.data.listed_files import ListedFiles
 from extrap_train.data.paths import check_relative
+from extrap_train.data.photograph_loader import DepthFile
 from extrap_train.data.photographs import (
     Listed,
     Photograph,
@@ -107,16 +108,15 @@ def _listed(
 def _photograph(files: ListedFiles, entry: dict[str, Any], file: Path, path: str) -> Photograph:
     try:
         height, width = _size(files.root / path, entry)
-        depth_path, depth_scale = _depth(files, entry)
+        mask = entry.get("mask_path")
         return Photograph(
             image_path=path,
             height=height,
             width=width,
             lens=lens_of(entry, height, width),
             world_to_cam=world_to_cam_from_opengl(_rigid(entry["transform_matrix"])),
-            depth_path=depth_path,
-            depth_scale=depth_scale,
-            mask_path=_existing(files, entry.get("mask_path")),
+            depth=_depth(files, entry),
+            mask_path=_find_or_keep(files, mask) if mask else None,
         )
     except KeyError as error:
         raise InputError(
@@ -137,24 +137,21 @@ def _size(picture: Path, entry: dict[str, Any]) -> tuple[int, int]:
     return height, width
 
 
-def _depth(files: ListedFiles, entry: dict[str, Any]) -> tuple[str | None, float]:
-    """The path of a depth file, if there is one, and scene units per unit of it.
-
-    nerfstudio's files have a unit unless told otherwise; instant-ngp's have the one that is told.
-    """
+def _depth(files: ListedFiles, entry: dict[str, Any]) -> DepthFile | None:
+    """nerfstudio's files are in millimetres by default; instant-ngp's state their unit."""
     if path := entry.get("depth_file_path"):
         unit = float(entry.get("depth_unit_scale_factor", MILLIMETRES))
         unit *= float(entry.get("applied_scale", 1.0))
     elif path := entry.get("depth_path"):
         unit = float(entry["integer_depth_scale"])
     else:
-        return None, 1.0
-    return _existing(files, path), unit
+        return None
+    return DepthFile(_find_or_keep(files, path), unit)
 
 
-def _existing(files: ListedFiles, path: Any) -> str | None:
-    """Where a file is; its path as it stands where it is nowhere, which reading it will say."""
-    return (files.find(str(path)) or str(path)) if path else None
+def _find_or_keep(files: ListedFiles, path: Any) -> str:
+    """Where a file is; where it is nowhere, its path as it stands, which reading it will report."""
+    return files.find(str(path)) or str(path)
 
 
 def _rigid(rows: Any) -> Float[Tensor, "4 4"]:

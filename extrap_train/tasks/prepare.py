@@ -30,9 +30,9 @@ from extrap_train.config import (
     placed,
 )
 from extrap_train.data.co3d import read_category, require_category
+from extrap_train.data.co3d.set_lists import read_sequence_split
 from extrap_train.data.prepared import PreparedData
 from extrap_train.data.sequences import Sequence
-from extrap_train.data.set_lists import read_sequence_split
 from extrap_train.jobs import Launcher
 from extrap_train.jobs.build import open_launcher
 

@@ -5,7 +5,7 @@ import torch
 from two_views import epipolar_distances
 
 from extrap_train.data.co3d import read_category, read_sequence
-from extrap_train.data.set_lists import read_set_list
+from extrap_train.data.co3d.set_lists import read_set_list
 
 
 def test_apple_features_lie_on_their_epipolar_lines(shared):

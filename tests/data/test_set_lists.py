@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from captures import write_capture
 
-from extrap_train.data.set_lists import read_sequence_split, read_set_list
+from extrap_train.data.co3d.set_lists import read_sequence_split, read_set_list
 from extrap_train.errors import InputError
 
 

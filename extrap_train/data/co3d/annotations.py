@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 from extrap_train.data.json_files import read_json_list
 from extrap_train.data.paths import check_relative
+from extrap_train.data.photograph_loader import DepthFile
 from extrap_train.data.picture_files import MAX_PIXELS
 from extrap_train.errors import InputError
 from extrap_train.geometry.pytorch3d import NDC_FORMATS
@@ -23,15 +24,6 @@ _CHALLENGE_TARGET = "_unseen"
 
 
 @dataclass(frozen=True, slots=True)
-class DepthFiles:
-    """A depth map (float16 in a 16-bit PNG) and which of its pixels to trust."""
-
-    path: str
-    scale: float
-    mask_path: str | None
-
-
-@dataclass(frozen=True, slots=True)
 class FrameAnnotation:
     """One frame; paths are relative to the data set's root."""
 
@@ -40,7 +32,7 @@ class FrameAnnotation:
     image_path: str
     size: tuple[int, int]
     """(height, width) in pixels."""
-    depth: DepthFiles | None
+    depth: DepthFile | None
     mask_path: str | None
     viewpoint: tuple[float, ...] | None
     """The numbers of `R`, `T`, `focal_length` and `principal_point`; they may make no sense."""
@@ -137,13 +129,14 @@ def _is_challenge_target(meta: Any) -> bool:
     return isinstance(kind, str) and kind.endswith(_CHALLENGE_TARGET)
 
 
-def _depth(entry: Any, file: Path) -> DepthFiles | None:
+def _depth(entry: Any, file: Path) -> DepthFile | None:
     if not entry or not entry.get("path"):
         return None
-    return DepthFiles(
+    return DepthFile(
         path=_path(entry["path"], file),
         scale=_number(entry["scale_adjustment"]),
         mask_path=_optional_path(entry, "mask_path", file),
+        is_half_float=True,
     )
 
 

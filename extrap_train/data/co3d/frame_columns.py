@@ -1,64 +1,36 @@
 """The frames of one CO3D sequence in a few arrays: a category has half a million of them."""
 
+import math
 import os
+from collections import defaultdict
 from collections.abc import Iterable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import overload
+from typing import cast, overload
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, Shaped
-from torch import Tensor
+from jaxtyping import Bool, Float, Int, Shaped
 
-from extrap_train.data.annotations import DepthFiles, FrameAnnotation
-from extrap_train.data.co3d_cameras import Cameras, cameras_of, frame_label
-from extrap_train.data.images import (
-    known_depth,
-    read_depth_mask,
-    read_photograph,
-    read_sixteen_bit,
-)
-from extrap_train.data.paths import file_stamp, require_file
+from extrap_train.data.co3d.annotations import VIEWPOINT, FrameAnnotation
+from extrap_train.data.paths import file_stamp
+from extrap_train.data.photograph_loader import DepthFile, PhotographLoader
 from extrap_train.data.sequences import Frame
-from extrap_train.data.validation import degenerate_camera
-from extrap_train.views import Camera, View
+from extrap_train.data.validation import degenerate_camera, is_degenerate
+from extrap_train.geometry.pytorch3d import NdcFormat, Viewpoint, camera_from_viewpoint
+from extrap_train.views import Camera
 
 _JPEG_HEADER_BYTES, _BLACK_PIXELS_PER_BYTE = 1024, 32
 
 
-@dataclass(frozen=True, slots=True)
-class _Photograph:
-    """One frame's files; a dataclass and no closure, so that worker processes can be sent it."""
+@dataclass(frozen=True)
+class _Cameras:
+    """One row per frame; those that are not sound must not be used."""
 
-    root: Path
-    image_path: str
-    depth: DepthFiles | None
-    mask_path: str | None
-    camera: Camera
-
-    @property
-    def name(self) -> str:
-        return self.image_path.rpartition("/")[2]
-
-    @property
-    def files(self) -> tuple[Path, ...]:
-        depth = (self.depth.path, self.depth.mask_path) if self.depth else ()
-        return tuple(self.root / p for p in (self.image_path, self.mask_path, *depth) if p)
-
-    def load(self, *, depth: bool = True) -> View:
-        size = self.camera.height, self.camera.width
-        mask_path = require_file(self.root / self.mask_path) if self.mask_path else None
-        image_path = require_file(self.root / self.image_path)
-        image, mask = read_photograph(image_path, size, mask_path)
-        return View(
-            image=image,
-            camera=self.camera,
-            depth=_read_depth(self.root, self.depth, size) if depth and self.depth else None,
-            mask=mask,
-            name=self.name,
-        )
+    world_to_cam: Float[np.ndarray, "n 4 4"]
+    intrinsics: Float[np.ndarray, "n 3 3"]
+    sound: Bool[np.ndarray, " n"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,16 +58,18 @@ class Co3dFrames(ListOf[Frame]):
         cls, root: Path, annotations: list[FrameAnnotation], file: Path
     ) -> tuple["Co3dFrames", tuple[str, ...]]:
         """In the annotations' order, and why some are left out: their camera is degenerate."""
-        cameras = cameras_of(annotations)
+        cameras = _convert_cameras(annotations)
         frames = cls._of(root, annotations, cameras)
         if cameras.sound.all():
             return frames, ()
         unsound = [annotations[i] for i in np.flatnonzero(~cameras.sound)]
-        reasons = tuple(degenerate_camera(frame_label(frame), file) for frame in unsound)
-        return frames._taken(cameras.sound), reasons
+        reasons = tuple(
+            degenerate_camera(f"{frame.sequence} frame {frame.number}", file) for frame in unsound
+        )
+        return frames._take(cameras.sound), reasons
 
     @classmethod
-    def _of(cls, root: Path, annotations: list[FrameAnnotation], cameras: Cameras) -> "Co3dFrames":
+    def _of(cls, root: Path, annotations: list[FrameAnnotation], cameras: _Cameras) -> "Co3dFrames":
         depths = [annotation.depth for annotation in annotations]
         return cls(
             root=root,
@@ -103,27 +77,27 @@ class Co3dFrames(ListOf[Frame]):
             size=np.array([annotation.size for annotation in annotations], np.int32),
             world_to_cam=cameras.world_to_cam,
             intrinsics=cameras.intrinsics,
-            image_path=_encoded(annotation.image_path for annotation in annotations),
-            mask_path=_encoded(annotation.mask_path for annotation in annotations),
-            depth_path=_encoded(depth.path if depth else None for depth in depths),
-            depth_mask_path=_encoded(depth.mask_path if depth else None for depth in depths),
+            image_path=_encode(annotation.image_path for annotation in annotations),
+            mask_path=_encode(annotation.mask_path for annotation in annotations),
+            depth_path=_encode(depth.path if depth else None for depth in depths),
+            depth_mask_path=_encode(depth.mask_path if depth else None for depth in depths),
             depth_scale=np.array([depth.scale if depth else 0.0 for depth in depths]),
         )
 
     @classmethod
-    def joined(cls, parts: ListOf["Co3dFrames"]) -> "Co3dFrames":
+    def join(cls, parts: ListOf["Co3dFrames"]) -> "Co3dFrames":
         """All frames of the parts, by number."""
         columns = {
             name: np.concatenate([getattr(part, name) for part in parts]) for name in cls._columns()
         }
         together = cls(root=parts[0].root, **columns)
-        return together._taken(np.argsort(together.number, kind="stable"))
+        return together._take(np.argsort(together.number, kind="stable"))
 
     @classmethod
     def _columns(cls) -> list[str]:
         return [field.name for field in fields(cls) if field.name != "root"]
 
-    def _taken(self, rows: Shaped[np.ndarray, " m"]) -> "Co3dFrames":
+    def _take(self, rows: Shaped[np.ndarray, " m"]) -> "Co3dFrames":
         """These rows alone, by their indices or a mask."""
         return replace(self, **{name: getattr(self, name)[rows] for name in self._columns()})
 
@@ -155,30 +129,24 @@ class Co3dFrames(ListOf[Frame]):
             height,
             width,
         )
-        photograph = _Photograph(
-            self.root,
-            os.fsdecode(self.image_path[index]),
-            self._depth(index),
-            os.fsdecode(self.mask_path[index]) or None,
-            camera,
-        )
-        return Frame(
-            name=photograph.name,
+        image_path = os.fsdecode(self.image_path[index])
+        return PhotographLoader(
+            root=self.root,
+            name=image_path.rpartition("/")[2],
             camera=camera,
-            has_depth=photograph.depth is not None,
-            has_mask=photograph.mask_path is not None,
-            load=photograph.load,
-            files=photograph.files,
-            reading=f"depth in {self.depth_scale[index]}",
-        )
+            image_path=image_path,
+            mask_path=os.fsdecode(self.mask_path[index]) or None,
+            depth=self._depth(index),
+        ).frame()
 
-    def _depth(self, index: int) -> DepthFiles | None:
+    def _depth(self, index: int) -> DepthFile | None:
         if not self.depth_path[index]:
             return None
-        return DepthFiles(
+        return DepthFile(
             os.fsdecode(self.depth_path[index]),
             float(self.depth_scale[index]),
             os.fsdecode(self.depth_mask_path[index]) or None,
+            is_half_float=True,
         )
 
 
@@ -195,13 +163,45 @@ def is_blackened(root: Path, annotation: FrameAnnotation) -> bool:
     return stamp is None or stamp[0] < _JPEG_HEADER_BYTES + height * width / _BLACK_PIXELS_PER_BYTE
 
 
-def _encoded(paths: Iterable[str | None]) -> Shaped[np.ndarray, " n"]:
+def _encode(paths: Iterable[str | None]) -> Shaped[np.ndarray, " n"]:
     return np.array([os.fsencode(path or "") for path in paths])
 
 
-def _read_depth(root: Path, files: DepthFiles, size: tuple[int, int]) -> Float[Tensor, "h w"]:
-    path = require_file(root / files.path)
-    depth = known_depth(read_sixteen_bit(path, size).view(np.float16), files.scale, path)
-    if files.mask_path:
-        depth *= read_depth_mask(require_file(root / files.mask_path), size)
-    return depth
+def _convert_cameras(annotations: list[FrameAnnotation]) -> _Cameras:
+    """One camera per frame, converted together where size and format agree (one by one is slow)."""
+    groups: dict[tuple[tuple[int, int], str], list[int]] = defaultdict(list)
+    for index, annotation in enumerate(annotations):
+        groups[annotation.size, annotation.intrinsics_format].append(index)
+    count = len(annotations)
+    world_to_cam = np.empty((count, 4, 4), np.float32)
+    intrinsics = np.empty((count, 3, 3), np.float32)
+    sound = np.empty(count, bool)
+    for ((height, width), ndc), members in groups.items():
+        batch = _convert_batch([annotations[i] for i in members], height, width, ndc)
+        world_to_cam[members] = batch.world_to_cam.numpy()
+        intrinsics[members] = batch.intrinsics.numpy()
+        sound[members] = ~is_degenerate(batch).numpy()
+    return _Cameras(world_to_cam, intrinsics, sound)
+
+
+def _convert_batch(annotations: list[FrameAnnotation], height: int, width: int, ndc: str) -> Camera:
+    """In single precision, as it is used: what is finite in double may be none there."""
+    numbers = torch.tensor(
+        [annotation.viewpoint for annotation in annotations], dtype=torch.float64
+    )
+    sizes = [math.prod(shape) for shape in VIEWPOINT.values()]
+    rotation, translation, focal_length, principal_point = numbers.split(sizes, dim=1)
+    camera = camera_from_viewpoint(
+        Viewpoint(
+            rotation=rotation.reshape(-1, 3, 3),
+            translation=translation,
+            focal_length=focal_length,
+            principal_point=principal_point,
+            intrinsics_format=cast(NdcFormat, ndc),
+        ),
+        height,
+        width,
+    )
+    return replace(
+        camera, world_to_cam=camera.world_to_cam.float(), intrinsics=camera.intrinsics.float()
+    )

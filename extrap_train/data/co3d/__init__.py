@@ -13,13 +13,13 @@ from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 
-from extrap_train.data.annotations import (
+from extrap_train.data.co3d.annotations import (
     FrameAnnotation,
     SequenceAnnotation,
     read_frame_annotations,
     read_sequence_annotations,
 )
-from extrap_train.data.co3d_frames import Co3dFrames, is_blackened
+from extrap_train.data.co3d.frame_columns import Co3dFrames, is_blackened
 from extrap_train.data.sequences import PointCloud, Sequence
 from extrap_train.errors import InputError, did_you_mean
 
@@ -155,7 +155,7 @@ def _sequence(
     details: SequenceAnnotation | None,
     file: Path,
 ) -> Sequence:
-    frames = Co3dFrames.joined(posed.parts)
+    frames = Co3dFrames.join(posed.parts)
     if frames.has_duplicates:
         raise InputError(f"{file}: sequence {name} lists an image twice; remove the second entry")
     cloud = details.point_cloud_path if details else None
