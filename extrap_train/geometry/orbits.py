@@ -64,10 +64,11 @@ def turned_cameras(
 
 def looking_at(
     positions: Float[np.ndarray, "n 3"],
-    target: Float[np.ndarray, "3"],
+    target: Float[np.ndarray, "#n 3"] | Float[np.ndarray, "3"],
     up: Float[np.ndarray, "3"],
 ) -> Float[np.ndarray, "n 4 4"]:
-    """`world_to_cam` of cameras that look at a point, with `up` upwards in their images."""
+    """`world_to_cam` of cameras that look at one point or each at its own, with `up` upwards in
+    their images."""
     forward = target - positions
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     right = np.cross(forward, up)

@@ -4,10 +4,9 @@
 `surface_points` the ground-truth cloud. Everything follows from (category, index, seed) alone.
 """
 
-from extrap_train.data.synthetic.build import build_scene
-from extrap_train.data.synthetic.orbit import handheld_orbit, sequence_name, walk_seed
-from extrap_train.data.synthetic.points import SurfacePoints, surface_points
-from extrap_train.data.synthetic.render import render, trace
+from extrap_train.data.synthetic.capture import handheld_orbit, sequence_name, walk_seed
+from extrap_train.data.synthetic.categories import build_scene
+from extrap_train.data.synthetic.render import SurfacePoints, render, surface_points, trace
 from extrap_train.data.synthetic.scene import SyntheticScene
 
 __all__ = [
