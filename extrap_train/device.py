@@ -2,10 +2,12 @@
 memory ends.
 """
 
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 import torch
 
+from extrap_train.config import LoraConfig, TrainerConfig
 from extrap_train.errors import InputError
 
 
@@ -41,3 +43,51 @@ def is_out_of_memory(error: BaseException) -> bool:
         return True
     # torch has no type of its own for the machine's memory.
     return isinstance(error, RuntimeError) and "can't allocate memory" in str(error)
+
+
+@contextmanager
+def advise_on_training_memory(options: TrainerConfig) -> Iterator[None]:
+    """Turn running out of memory in training into one line with what helps; other errors pass."""
+    remedies = [
+        (not options.gradient_checkpointing, "trainer.gradient_checkpointing=true"),
+        (options.batch_size > 1, f"trainer.batch_size={max(1, options.batch_size // 2)}"),
+        (options.ema_decay > 0, "trainer.ema_decay=0 (no averaged weights)"),
+    ]
+    with _out_of_memory_advice(f"at trainer.batch_size={options.batch_size}", remedies):
+        yield
+
+
+@contextmanager
+def advise_on_adapting_memory(lora: LoraConfig, trainer: TrainerConfig) -> Iterator[None]:
+    """`advise_on_training_memory` for an adapter's training."""
+    remedies = [
+        (not trainer.gradient_checkpointing, "trainer.gradient_checkpointing=true"),
+        (lora.batch_size > 1, f"lora.batch_size={max(1, lora.batch_size // 2)}"),
+        (lora.convolutions, "lora.convolutions=false"),
+    ]
+    with _out_of_memory_advice(f"at lora.batch_size={lora.batch_size}", remedies):
+        yield
+
+
+@contextmanager
+def advise_on_sampling_memory(at_once: int, trainer: TrainerConfig) -> Iterator[None]:
+    """`advise_on_training_memory` for sampling so many views at once."""
+    remedies = [
+        (at_once > 1, f"painted_at_once={max(1, at_once // 2)}"),
+        (torch.cuda.is_available() and trainer.accelerator != "cpu", "trainer.accelerator=cpu"),
+    ]
+    with _out_of_memory_advice(f"sampling {at_once} views at once", remedies):
+        yield
+
+
+@contextmanager
+def _out_of_memory_advice(where: str, remedies: list[tuple[bool, str]]) -> Iterator[None]:
+    """InputError with the first two remedies that are left, each with whether it is."""
+    try:
+        yield
+    except (torch.OutOfMemoryError, MemoryError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        left = [remedy for helps, remedy in remedies if helps][:2]
+        advice = f"give {' or '.join(left)}" if left else "it takes a device with more memory"
+        raise InputError(f"out of memory {where}: {advice}") from None

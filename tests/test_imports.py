@@ -14,7 +14,7 @@ _ROOT = Path(__file__).parents[1]
 _RANK = {
     "extrap_train.errors": 0,
     "extrap_train.config": 1,
-    "extrap_train.device": 0,
+    "extrap_train.device": 1,
     "extrap_train.store": 1,
     "extrap_train.weight_files": 1,
     "extrap_train.views": 1,

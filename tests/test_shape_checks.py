@@ -5,7 +5,7 @@ import torch
 from jaxtyping import TypeCheckError
 from scenes import orbit_camera
 
-from extrap_train.diffusion.image_encoder import SmallImageEncoder
+from extrap_train.diffusion.encoders import SmallImageEncoder
 from extrap_train.geometry.cameras import project
 from extrap_train.metrics import psnr
 from extrap_train.views import Camera, View

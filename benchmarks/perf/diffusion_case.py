@@ -11,13 +11,12 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils.flop_counter import FlopCounterMode
 
+from benchmarks.perf.live_bytes import LiveBytes
 from benchmarks.perf.warp import ANGLES_DEG, QUERY_ANGLE_DEG, orbit_camera
 from extrap_train.config import ClipConfig, ModelConfig, UNetConfig, VaeConfig
 from extrap_train.data.module import compute_warp
-from extrap_train.diffusion.frozen import Frozen
-from extrap_train.diffusion.layout import arranged
-from extrap_train.diffusion.memory import LiveBytes
-from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.encoders import Frozen
+from extrap_train.diffusion.model import ExtrapolationModel, use_channels_last
 from extrap_train.views import PairBatch, stack_cameras
 
 IMAGE_SIZE = 256
@@ -70,7 +69,7 @@ def optimised(config: ModelConfig, device: torch.device) -> ExtrapolationModel:
     torch.manual_seed(0)
     model = ExtrapolationModel(config).to(device)
     torch.nn.init.normal_(model.unet.conv_out.weight, std=0.02)
-    return arranged(model)
+    return use_channels_last(model)
 
 
 def plain(model: ExtrapolationModel) -> ExtrapolationModel:

@@ -22,8 +22,7 @@ from benchmarks.perf.diffusion_case import (
 from benchmarks.perf.timing import Row, compare
 from extrap_train.config import SamplerConfig
 from extrap_train.diffusion.model import ExtrapolationModel
-from extrap_train.diffusion.sampler import sample_ddim, sample_views, view_generator
-from extrap_train.diffusion.schedule import ddim_timesteps
+from extrap_train.diffusion.sampler import ddim_timesteps, sample_ddim, sample_views, view_generator
 from extrap_train.views import PairBatch
 
 _GUIDANCE = 3.0

@@ -12,11 +12,10 @@ from safetensors import safe_open
 from torch import Tensor
 
 from extrap_train.config import ModelConfig, dotted, validate_model
-from extrap_train.diffusion.autoencoder import PixelPatches
-from extrap_train.diffusion.compact import compress, restore
+from extrap_train.diffusion.encoders import PixelPatches
 from extrap_train.diffusion.model import ExtrapolationModel
-from extrap_train.diffusion.packaged import MODEL_CONFIG, packaged_weights
-from extrap_train.diffusion.published.meaning import SCHEDULER, require_same_meaning
+from extrap_train.diffusion.packaged import MODEL_CONFIG, compress, packaged_weights, restore
+from extrap_train.diffusion.published.config_compat import SCHEDULER, require_same_config
 from extrap_train.diffusion.published.read import SOURCES, Shapes, read_published, weights_at
 from extrap_train.diffusion.transfer import narrowed, turned_pose, widened
 from extrap_train.errors import InputError
@@ -164,7 +163,7 @@ def load_weights(
     if is_own(path):
         _require_same_start(path, model.config)
     else:
-        require_same_meaning(path, {**networks, SCHEDULER: model.schedule}, to_train=to_train)
+        require_same_config(path, {**networks, SCHEDULER: model.schedule}, to_train=to_train)
     wanted = {
         part: {name: x.shape for name, x in network.state_dict().items()}
         for part, network in networks.items()

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from extrap_train.diffusion.autoencoder import Autoencoder
+from extrap_train.diffusion.encoders import Autoencoder
 from extrap_train.geometry.encoding import coordinate_grid, positional_encoding
 from extrap_train.geometry.fill import fill_holes
 from extrap_train.views import PairBatch, Warp, combine

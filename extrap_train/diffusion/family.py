@@ -18,7 +18,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrap_train.config import ModelConfig
-from extrap_train.diffusion.autoencoder import Autoencoder
 from extrap_train.diffusion.conditioning import (
     Null,
     concatenated_latents,
@@ -27,6 +26,7 @@ from extrap_train.diffusion.conditioning import (
     geometry_channels,
     warp_of,
 )
+from extrap_train.diffusion.encoders import Autoencoder
 from extrap_train.diffusion.pose_encoding import depth_scale, megascenes_pose, zeronvs_pose
 from extrap_train.geometry.resample import lanczos_resize
 from extrap_train.views import PairBatch, Warp

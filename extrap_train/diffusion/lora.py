@@ -1,11 +1,12 @@
 """A scene's adapter: low-rank additions to a denoiser's layers, saved apart from its weights."""
 
 import hashlib
+import shlex
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import peft
 import torch
@@ -14,12 +15,6 @@ from safetensors import SafetensorError
 from torch import Tensor, nn
 
 from extrap_train.config import LoraConfig
-from extrap_train.diffusion.adapter_card import (
-    AdapterOrigin,
-    AdapterRecord,
-    BaseHashes,
-    model_card,
-)
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import write_atomic
@@ -38,6 +33,40 @@ _REMEDY = "{} is no adapter folder of task=scene, or is damaged: make it again"
 _MAX_RANK = 1024
 
 _Target = Literal["to_q", "to_k", "to_v", "to_out.0", "conv1", "conv2"]
+
+
+@dataclass(frozen=True)
+class AdapterOrigin:
+    """What an adapter was made from."""
+
+    scene: str
+    """Its address, the same from any folder."""
+    photographs: Mapping[str, str]
+    """SHA-256 of the content of the frames that it was trained on, by their names."""
+    weights: str
+    """Model folder, or a packaged model's name."""
+    options: Mapping[str, Any]
+    """By dotted key."""
+    outcome: str
+    """How its training ended."""
+
+
+@dataclass(frozen=True)
+class BaseHashes:
+    """SHA-256 of the weights that an adapter belongs to."""
+
+    denoiser: str
+    others: str
+    """Of the networks that tell the denoiser what to paint."""
+
+
+@dataclass(frozen=True)
+class AdapterRecord(AdapterOrigin):
+    """`base.json` in an adapter's folder."""
+
+    base: BaseHashes
+    tensors: str
+    """SHA-256 of the file of the adapter's own tensors."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +122,7 @@ def save_adapter(
     tensors = file_digest(folder / _WEIGHTS)
     record = AdapterRecord(**vars(origin), base=base_hashes(model), tensors=tensors)
     write_record(folder / _BASE, record)
-    write_atomic(folder / _CARD, model_card(record).encode())
+    write_atomic(folder / _CARD, _model_card(record).encode())
 
 
 def adapter_bytes(adapter: peft.PeftModel) -> int:
@@ -135,6 +164,29 @@ def load_adapter(model: ExtrapolationModel, folder: Path) -> peft.PeftModel:
         )
     peft.set_peft_model_state_dict(adapter, weights)
     return adapter
+
+
+def _model_card(record: AdapterRecord) -> str:
+    """The `README.md` of an adapter's folder."""
+    rows = {
+        "scene": f"`{record.scene}`",
+        "photographs": ", ".join(f"`{name}`" for name in record.photographs),
+        "weights": f"`{record.weights}`",
+        "SHA-256 of the denoiser": f"`{record.base.denoiser}`",
+        "SHA-256 of its other networks": f"`{record.base.others}`",
+        "training": record.outcome,
+        "options": ", ".join(f"`{name}={value}`" for name, value in record.options.items()),
+    }
+    options = {
+        "weights": record.weights,
+        "scene": record.scene,
+        "input_frames": f"[{','.join(record.photographs)}]",
+    }
+    return _CARD_TEXT.format(
+        rows="\n".join(f"| {name} | {value} |" for name, value in rows.items()),
+        command=" ".join(shlex.quote(f"{name}={value}") for name, value in options.items()),
+        weights=record.weights,
+    )
 
 
 def _read_tensors(file: Path, sha256: str, remedy: str) -> dict[str, Tensor]:
@@ -179,3 +231,36 @@ def _hash(networks: Iterable[nn.Module]) -> str:
                 digest.update(name.replace(".base_layer", "").encode())
                 digest.update(value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy())
     return digest.hexdigest()
+
+
+_CARD_TEXT = """---
+library_name: peft
+tags:
+- lora
+- novel-view-synthesis
+---
+# An adapter for one scene
+
+Low-rank additions to the denoiser of a view-extrapolation model, trained on photographs of one
+scene alone. It paints new views of that scene; other scenes may come out worse than without it.
+
+| | |
+|---|---|
+{rows}
+
+`base.json` says the same for programs. The adapter is refused on other weights than these.
+
+## Use
+
+```bash
+python -m extrap_train task=view category=NAME {command} orbit=360 adapter=FOLDER
+```
+
+```python
+from extrap_train.tasks.view import open_generator
+
+generator = open_generator({weights!r}, adapter="FOLDER")
+```
+
+Any `category` will do. In plain peft: `PeftModel.from_pretrained(unet, "FOLDER")`.
+"""

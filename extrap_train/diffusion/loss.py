@@ -35,9 +35,10 @@ def diffusion_loss(
     min_snr: float | None = None,
     anchor: Anchor | None = None,
 ) -> Float[Tensor, ""]:
-    """Mean squared error of the prediction at one random noise level per example.
+    """The training step: mean squared error of the prediction, one random noise level per example.
 
-    Every random number comes from the (CPU) generator, so that a step is a function of its seed
+    The condition is dropped for a share of the examples, for classifier-free guidance. Every random
+    number comes from the (CPU) generator, so that a step is a function of its seed
     alone. `min_snr` weighs the levels, see `snr_weights`.
     """
     conditioning = model.condition(batch)
@@ -66,13 +67,15 @@ def prediction_errors(
     With an anchor, against the truth where it is known and the unchanged model's prediction
     elsewhere, mixed by area where a latent is both.
     """
-    noisy = model.schedule.add_noise(target, noise, timestep)
+    alpha = model.schedule.alphas_cumprod.to(target)[timestep, None, None, None]
+    signal, spread = alpha**0.5, (1 - alpha) ** 0.5
+    noisy = signal * target + spread * noise  # equation 4 of Ho et al. 2020
     prediction = model(noisy, timestep, conditioning)
     wanted = {
-        "epsilon": lambda: noise,
-        "sample": lambda: target,
-        "v_prediction": lambda: model.schedule.get_velocity(target, noise, timestep),
-    }[model.config.prediction]()
+        "epsilon": noise,
+        "sample": target,
+        "v_prediction": signal * noise - spread * target,  # Salimans and Ho 2022, appendix D
+    }[model.config.prediction]
     if anchor is not None:
         with torch.no_grad(), anchor.unchanged():
             before = model(noisy, timestep, conditioning).to(wanted)

@@ -5,17 +5,20 @@ prediction.
 from typing import Any
 
 import torch
+from diffusers import DDIMScheduler, UNet2DConditionModel
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from extrap_train.config import ModelConfig
-from extrap_train.diffusion.autoencoder import KlAutoencoder, build_autoencoder
+from extrap_train.config import ModelConfig, UNetConfig
 from extrap_train.diffusion.conditioning import Conditioning
-from extrap_train.diffusion.denoiser import build_unet
+from extrap_train.diffusion.encoders import (
+    ClipImageEncoder,
+    KlAutoencoder,
+    build_autoencoder,
+    build_image_encoder,
+)
 from extrap_train.diffusion.family import FAMILIES
-from extrap_train.diffusion.image_encoder import ClipImageEncoder, build_image_encoder
 from extrap_train.diffusion.pose_encoding import POSE_CHANNELS
-from extrap_train.diffusion.schedule import noise_schedule
 from extrap_train.errors import InputError
 from extrap_train.views import PairBatch
 
@@ -102,3 +105,60 @@ class ExtrapolationModel(nn.Module):
     ) -> Float[Tensor, "b 3 h w"]:
         """The image in [0, 1] of a denoised latent."""
         return self.autoencoder.decode(latent + conditioning.base).clamp(0, 1)
+
+
+def build_unet(
+    config: UNetConfig, in_channels: int, out_channels: int, latent_size: int
+) -> UNet2DConditionModel:
+    """A randomly initialised UNet; its last layer starts at zero, so that training starts calm."""
+    down = ["CrossAttnDownBlock2D" if level else "DownBlock2D" for level in config.attention_levels]
+    up = ["CrossAttnUpBlock2D" if level else "UpBlock2D" for level in config.attention_levels[::-1]]
+    unet = UNet2DConditionModel(
+        sample_size=latent_size,
+        in_channels=in_channels,
+        out_channels=out_channels,
+        block_out_channels=tuple(config.channels),
+        layers_per_block=config.layers_per_block,
+        down_block_types=tuple(down),
+        up_block_types=tuple(up),
+        cross_attention_dim=config.token_width,
+        attention_head_dim=config.heads,  # diffusers' historical name for the number of heads
+        norm_num_groups=config.norm_groups,
+    )
+    unet.conv_out.weight.data.zero_()
+    unet.conv_out.bias.data.zero_()
+    return unet
+
+
+def noise_schedule(config: ModelConfig) -> DDIMScheduler:
+    """1000 steps, `scaled_linear` as in ZeroNVS (METHOD section 3).
+
+    With zero terminal SNR (Lin et al. 2023) the last step is pure noise, so sampling starts where
+    training ended ("trailing"); an ε-prediction says nothing there, hence it is refused.
+    """
+    if config.zero_terminal_snr and config.prediction == "epsilon":
+        raise ValueError(
+            "zero terminal SNR needs model.prediction=v_prediction or sample, not epsilon"
+        )
+    return DDIMScheduler(
+        num_train_timesteps=1000,
+        beta_start=0.00085,
+        beta_end=0.012,
+        beta_schedule="scaled_linear",
+        clip_sample=False,
+        set_alpha_to_one=config.zero_terminal_snr,
+        steps_offset=0 if config.zero_terminal_snr else 1,
+        timestep_spacing="trailing" if config.zero_terminal_snr else "leading",
+        prediction_type=config.prediction,
+        rescale_betas_zero_snr=config.zero_terminal_snr,
+    )
+
+
+def use_channels_last(model: ExtrapolationModel) -> ExtrapolationModel:
+    """The model with every network's convolutions channels last, the frozen ones' too.
+
+    The results are the same but for rounding. docs/performance.md has what it brings.
+    """
+    for network in model.parts().values():
+        network.to(memory_format=torch.channels_last)
+    return model

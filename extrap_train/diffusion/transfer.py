@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrap_train.diffusion.autoencoder import PixelPatches
+from extrap_train.diffusion.encoders import PixelPatches
 from extrap_train.diffusion.pose_encoding import POSE_CHANNELS
 
 _OPENGL = torch.tensor([1.0, -1.0, -1.0, 1.0])

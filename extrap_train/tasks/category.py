@@ -17,12 +17,10 @@ from rich.console import Console
 from extrap_train.config import TrainConfig, placed
 from extrap_train.data.module import PairModule
 from extrap_train.data.prepared import PreparedData
-from extrap_train.device import require_accelerator
+from extrap_train.device import advise_on_training_memory, require_accelerator
 from extrap_train.diffusion.callbacks import AveragedWeights, MetricsTable, StepProgress
 from extrap_train.diffusion.checkpoint import initial_model, save_model
-from extrap_train.diffusion.layout import arranged
-from extrap_train.diffusion.memory import advice_where_memory_ends, training_memory
-from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.model import ExtrapolationModel, use_channels_last
 from extrap_train.diffusion.resume import (
     Checkpoints,
     WholeCheckpointIO,
@@ -67,8 +65,6 @@ def run(config: TrainConfig) -> Outcome:
     folder = run_folder(config)
     require_same_options(folder, config)  # before what takes minutes
     model = _model(config)
-    if (needed := training_memory(model, config.trainer)).is_worth_a_word:
-        console.print(f"{needed}")
     started = time.perf_counter()
     prepared = prepared_data(config)
     data = data_module(config, prepared)
@@ -148,7 +144,7 @@ def _train(
         _ended_together(trainer),
         kept.stoppable(),
         restoring(checkpoint, lambda: kept.has_begun),
-        advice_where_memory_ends(training.config.trainer),
+        advise_on_training_memory(training.config.trainer),
     ):
         trainer.fit(training, data, ckpt_path=checkpoint, weights_only=True)
         seconds["train"] = time.perf_counter() - started
@@ -185,7 +181,9 @@ def quieten_lightning() -> None:
 
 def _model(config: TrainConfig) -> ExtrapolationModel:
     torch.manual_seed(config.seed)
-    model = arranged(initial_model(placed(config.model)))  # says for good what it started from
+    model = use_channels_last(
+        initial_model(placed(config.model))
+    )  # says for good what it started from
     if config.trainer.gradient_checkpointing:
         model.unet.enable_gradient_checkpointing()
     if config.trainer.compile:

@@ -24,7 +24,7 @@ from extrap_train.data.scene import SYNTHETIC_SCHEME, open_scene
 from extrap_train.data.sequences import Frame, Sequence
 from extrap_train.data.synthetic import SyntheticScene, build_scene
 from extrap_train.depth.build import depth_source
-from extrap_train.diffusion.memory import advice_where_painting_ends
+from extrap_train.device import advise_on_sampling_memory
 from extrap_train.errors import InputError
 from extrap_train.reconstruction.completion import Step, Workshop, complete, map_of_inputs
 from extrap_train.reconstruction.exact import ExactDepth, ExactGenerator
@@ -162,7 +162,7 @@ def _run(job: _Job, console: Console) -> bool:
     missing = _count_missing(known, queries)
     require_space(job.folder, missing * view_bytes(workshop.generator.warp_size))
     with _viewer(job, known, console) as viewer:
-        with advice_where_painting_ends(1, job.config.trainer):
+        with advise_on_sampling_memory(1, job.config.trainer):
             known = _completed(job, known, queries, workshop, viewer)
         steps = load_steps(job.folder / "map", len(known))
         seconds = {

@@ -10,8 +10,7 @@ from extrap_train.config import TrainConfig
 from extrap_train.data.prepared import PreparedData
 from extrap_train.device import require_accelerator
 from extrap_train.diffusion.checkpoint import saved_config
-from extrap_train.diffusion.layout import arranged
-from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.model import ExtrapolationModel, use_channels_last
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.metrics import lpips_or_reason
 from extrap_train.runs import RunFolder, provenance, trained_on
@@ -62,7 +61,9 @@ def measure(
     quieten_lightning()
     distance, missing = lpips_or_reason(config.validation.lpips_weights)
     pairs = data_module(replace(config, model=model.config), data.prepared)
-    validation = CategoryTraining(arranged(model), config, validation_names(pairs), distance)
+    validation = CategoryTraining(
+        use_channels_last(model), config, validation_names(pairs), distance
+    )
     _validator(config).validate(validation, pairs, verbose=False)
     results = Results(
         scores=validation.scores(),

@@ -17,17 +17,17 @@ from extrap_train.data.examples import linspace_indices
 from extrap_train.data.scene import scene_address
 from extrap_train.data.scene_pairs import AdaptationPairs, adaptation_pairs
 from extrap_train.data.sequences import Frame, Sequence
+from extrap_train.device import advise_on_adapting_memory
 from extrap_train.diffusion.adaptation import Adaptation, adapt
-from extrap_train.diffusion.adapter_card import AdapterOrigin
 from extrap_train.diffusion.evaluation import score_images, summarise
 from extrap_train.diffusion.generator import GeneratedViews
 from extrap_train.diffusion.lora import (
+    AdapterOrigin,
     adapter_bytes,
     add_adapter,
     read_adapter_record,
     save_adapter,
 )
-from extrap_train.diffusion.memory import advice_where_adapting_ends
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError
 from extrap_train.metrics import Distance, lpips_or_reason
@@ -108,7 +108,7 @@ def _run(
         model.unet.enable_gradient_checkpointing()
     adapter = add_adapter(model, config.lora, config.seed)
     require_space(result.folder, adapter_bytes(adapter) + _PICTURES_BYTES)
-    advice = advice_where_adapting_ends(config.lora, config.trainer)
+    advice = advise_on_adapting_memory(config.lora, config.trainer)
     with progress("adapting", 100, "%") as bar, advice:
         bar.reach(0, "measuring the base")
 

@@ -11,13 +11,11 @@ from lightning.fabric import Fabric
 from extrap_train.config import ModelConfig, TrainConfig, dotted, sampler_for
 from extrap_train.data.scene import scene_address
 from extrap_train.data.sequences import Frame
-from extrap_train.device import require_accelerator
+from extrap_train.device import advise_on_sampling_memory, require_accelerator
 from extrap_train.diffusion.checkpoint import is_own, load_model, published_model, saved_config
 from extrap_train.diffusion.generator import DiffusionGenerator, GeneratedViews
-from extrap_train.diffusion.layout import arranged
 from extrap_train.diffusion.lora import load_adapter, read_adapter_record
-from extrap_train.diffusion.memory import advice_where_painting_ends
-from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.model import ExtrapolationModel, use_channels_last
 from extrap_train.diffusion.packaged import (
     packaged_name,
     packaged_names,
@@ -187,7 +185,7 @@ def open_model(
         )
     if adapter is not None:
         load_adapter(model, Path(adapter))
-    return arranged(model).eval()
+    return use_channels_last(model).eval()
 
 
 def _folder_of(weights: str) -> Path:
@@ -218,5 +216,5 @@ def generate_views(
     config: TrainConfig,
 ) -> GeneratedViews:
     """The generator's views; InputError that says which option to change where memory ends."""
-    with advice_where_painting_ends(config.painted_at_once, config.trainer):
+    with advise_on_sampling_memory(config.painted_at_once, config.trainer):
         return generator.generate(views, cameras, names, config.seed)

@@ -19,8 +19,8 @@ from extrap_train.diffusion.checkpoint import (
     save_compact,
     save_model,
 )
-from extrap_train.diffusion.compact import dequantised, quantised
 from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.packaged import dequantised, quantised
 from extrap_train.errors import InputError
 
 

@@ -8,7 +8,6 @@ import torch
 
 from extrap_train.config import ModelConfig
 from extrap_train.data.module import compute_warp
-from extrap_train.diffusion.autoencoder import PixelPatches
 from extrap_train.diffusion.conditioning import (
     Conditioning,
     Null,
@@ -17,6 +16,7 @@ from extrap_train.diffusion.conditioning import (
     filled_warp,
     geometry_channels,
 )
+from extrap_train.diffusion.encoders import PixelPatches
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.geometry.encoding import coordinate_grid, positional_encoding
 from extrap_train.views import PairBatch

@@ -1,11 +1,10 @@
-"""Every task paints with a model that is arranged for its convolutions, and paints the same."""
+"""Every task samples with a model whose convolutions lie channels last, and samples the same."""
 
 import torch
 
 from extrap_train.config import ModelConfig, SamplerConfig
 from extrap_train.diffusion.checkpoint import load_model
-from extrap_train.diffusion.layout import arranged
-from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.model import ExtrapolationModel, use_channels_last
 from extrap_train.diffusion.packaged import packaged_weights
 from extrap_train.diffusion.sampler import sample_views
 from extrap_train.tasks.view import open_generator
@@ -30,5 +29,5 @@ def test_it_paints_the_same(config: ModelConfig, batch: PairBatch) -> None:
         return sample_views(model, batch, SamplerConfig(steps=3), "abc")
 
     before = painted()
-    assert arranged(model) is model
+    assert use_channels_last(model) is model
     torch.testing.assert_close(painted(), before, atol=1e-4, rtol=0)

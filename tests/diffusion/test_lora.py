@@ -12,11 +12,12 @@ from lightning.fabric import Fabric
 from orbits import walls
 from torch import Tensor, nn
 
+from benchmarks.perf.live_bytes import LiveBytes
 from extrap_train.config import LoraConfig, ModelConfig, SamplerConfig
 from extrap_train.data.scene_pairs import adaptation_pairs
 from extrap_train.diffusion.adaptation import Adaptation, adapt
-from extrap_train.diffusion.adapter_card import AdapterOrigin
 from extrap_train.diffusion.lora import (
+    AdapterOrigin,
     add_adapter,
     base_hashes,
     load_adapter,
@@ -24,7 +25,6 @@ from extrap_train.diffusion.lora import (
     save_adapter,
 )
 from extrap_train.diffusion.loss import diffusion_loss
-from extrap_train.diffusion.memory import LiveBytes
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sample_views
 from extrap_train.errors import InputError

@@ -9,8 +9,7 @@ import torch
 
 from extrap_train.config import ModelConfig
 from extrap_train.diffusion.loss import Anchor, diffusion_loss, prediction_errors, snr_weights
-from extrap_train.diffusion.model import ExtrapolationModel
-from extrap_train.diffusion.schedule import noise_schedule
+from extrap_train.diffusion.model import ExtrapolationModel, noise_schedule
 from extrap_train.views import PairBatch
 
 

@@ -11,13 +11,15 @@ from torch import Tensor, nn
 
 from extrap_train.config import ModelConfig, SamplerConfig, SamplerOptions, sampler_for
 from extrap_train.diffusion.conditioning import Conditioning, filled_warp
-from extrap_train.diffusion.model import ExtrapolationModel
-from extrap_train.diffusion.sampler import guide, sample_ddim, sample_views, view_generator
-from extrap_train.diffusion.schedule import (
+from extrap_train.diffusion.model import ExtrapolationModel, noise_schedule
+from extrap_train.diffusion.sampler import (
     ddim_timesteps,
     even_in_log_snr,
-    noise_schedule,
+    guide,
+    sample_ddim,
+    sample_views,
     sampling_timesteps,
+    view_generator,
 )
 from extrap_train.errors import InputError
 from extrap_train.views import PairBatch

@@ -24,8 +24,7 @@ from extrap_train.config import LoraConfig, ModelConfig, PrepConfig, UNetConfig
 from extrap_train.data.co3d import read_category
 from extrap_train.data.prepared import PreparedData
 from extrap_train.depth.dataset import DatasetDepth
-from extrap_train.diffusion.adapter_card import AdapterOrigin
-from extrap_train.diffusion.lora import add_adapter, load_adapter, save_adapter
+from extrap_train.diffusion.lora import AdapterOrigin, add_adapter, load_adapter, save_adapter
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError
 from extrap_train.reconstruction.completion import Step

@@ -14,10 +14,9 @@ from PIL import Image
 
 from extrap_train.config import LoraConfig, SyntheticConfig
 from extrap_train.data.scene import open_scene
-from extrap_train.diffusion.adapter_card import AdapterOrigin
 from extrap_train.diffusion.checkpoint import load_model, save_model
 from extrap_train.diffusion.generator import DiffusionGenerator
-from extrap_train.diffusion.lora import add_adapter, save_adapter
+from extrap_train.diffusion.lora import AdapterOrigin, add_adapter, save_adapter
 from extrap_train.pictures import picture_names
 from extrap_train.tasks.scene_content import frame_digest
 from extrap_train.tasks.view import open_generator, open_views, walk

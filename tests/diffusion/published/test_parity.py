@@ -15,10 +15,9 @@ from torch import Tensor
 from extrap_train.config import SamplerConfig
 from extrap_train.diffusion.checkpoint import initial_model
 from extrap_train.diffusion.conditioning import Conditioning
-from extrap_train.diffusion.image_encoder import clip_input
+from extrap_train.diffusion.encoders import clip_input
 from extrap_train.diffusion.model import ExtrapolationModel
-from extrap_train.diffusion.sampler import guided_denoiser, sample_ddim
-from extrap_train.diffusion.schedule import ddim_timesteps
+from extrap_train.diffusion.sampler import ddim_timesteps, guided_denoiser, sample_ddim
 
 
 def assert_parity(ours: Tensor, expected: Tensor) -> None:

@@ -65,7 +65,7 @@ _KEYS: dict[str, dict[str, str]] = {
 _MAX_BYTES = 2**20
 
 
-def require_same_meaning(folder: Path, networks: Mapping[str, Any], *, to_train: bool) -> None:
+def require_same_config(folder: Path, networks: Mapping[str, Any], *, to_train: bool) -> None:
     """InputError for the first key of a diffusers folder that the networks have another value of.
 
     `networks` are the model's by the names of their folders, its scheduler among them. A part
