@@ -8,8 +8,8 @@ from extrap_train.config import DataPrepConfig
 
 def _run(config: DataPrepConfig) -> None:
     # Heavy imports wait until the options are known to be right.
+    from data_prep.category import check_members, prepare_category
     from data_prep.prep_report import write_report
-    from extrap_train.tasks.prepare import check_members, prepare_category
     from extrap_train.terminal import terminal
 
     check_members(config.category, config.data)

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from data_prep.frames import too_many_unusable
 from extrap_train.config import PrepConfig
 from extrap_train.data.camera_check import CO3D_POSES, find_pose_fault
 from extrap_train.data.sequences import Sequence
+from extrap_train.data.square_frames import too_many_unusable
 from extrap_train.data.validation import is_degenerate
 from extrap_train.geometry.viewpoints import facing, fit_orbit, scene_center
 from extrap_train.views import Camera, stack_poses

@@ -9,7 +9,6 @@ import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
@@ -24,7 +23,7 @@ from extrap_train.config import (
 )
 from extrap_train.data.paths import file_stamp
 from extrap_train.depth import DepthSource
-from extrap_train.depth.build import depth_source
+from extrap_train.depth.build import depth_source, weight_files
 from extrap_train.device import fastest_device
 from extrap_train.matching import Matcher
 from extrap_train.matching.build import matcher
@@ -85,20 +84,6 @@ class PrepModels:
 
 def _identity(model: object) -> str:
     return f"{model!r} {[file_stamp(file) for file in weight_files(model)]}"
-
-
-def weight_files(model: object) -> list[Path]:
-    """The files of weights that a depth source or a matcher reads."""
-    match model:
-        case Mast3rConfig() | LoftrMatcherConfig() | AlikedMatcherConfig():
-            return [Path(model.checkpoint or "")]
-        case MonocularConfig():
-            # transformers takes seconds to load: only where it is wanted.
-            from extrap_train.depth.depth_anything import files_read
-
-            return [*files_read(model.model), *weight_files(model.matcher)]
-        case _:
-            return []
 
 
 def release_models() -> None:

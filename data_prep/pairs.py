@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float
 
 from data_prep.correct import correct_pair
 from data_prep.select import select_pairs
-from data_prep.split import held_out
 from extrap_train.config import PrepConfig
 from extrap_train.data.frame_files import (
     FLOWS,
@@ -23,6 +22,7 @@ from extrap_train.data.frame_files import (
     read_sealed,
     write_sealed,
 )
+from extrap_train.data.square_frames import held_out
 from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
 from extrap_train.matching import Matcher
 from extrap_train.store.atomic import atomic_folder

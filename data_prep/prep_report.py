@@ -14,9 +14,9 @@ from rich.console import Console
 from rich.table import Table
 
 from data_prep.drop_summary import group_reasons
-from data_prep.split import held_out
 from extrap_train.data.examples import collate, linspace_indices, read_example
 from extrap_train.data.prepared import UNTOUCHED, Pairs, PreparedData
+from extrap_train.data.square_frames import held_out
 from extrap_train.geometry.viewpoints import fit_orbit
 from extrap_train.geometry.warp import warp_references
 from extrap_train.pictures import colour_depth, contact_sheet, error_map, mark_holes

@@ -13,7 +13,6 @@ from typing import Any
 from data_prep.correct import METHOD as CORRECTION_METHOD
 from data_prep.drop_summary import group_reasons
 from data_prep.filter import judge_all
-from data_prep.frames import METHOD, CaptureKeys, too_many_unusable
 from data_prep.model_cache import PrepModels, release_models
 from data_prep.sequence_job import NO_SPACE, PrepContext, SequenceJob, prepare_sequence
 from data_prep.split import Split, split_sequences
@@ -21,6 +20,7 @@ from data_prep.tables import Outcome, write_results
 from extrap_train.config import DepthConfig, MatcherConfig, PrepConfig
 from extrap_train.data.prepared import FORMAT, PreparedData
 from extrap_train.data.sequences import Sequence
+from extrap_train.data.square_frames import METHOD, CaptureKeys, too_many_unusable
 from extrap_train.depth import DepthSource
 from extrap_train.errors import InputError
 from extrap_train.jobs import Died, Launcher

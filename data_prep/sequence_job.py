@@ -12,7 +12,6 @@ from pathlib import Path
 import torch
 
 from data_prep.correct import METHOD
-from data_prep.frames import make_frames
 from data_prep.model_cache import PrepModels
 from data_prep.pairs import PairFiles, choose_pairs, correct_pairs
 from extrap_train.config import PrepConfig
@@ -25,6 +24,7 @@ from extrap_train.data.frame_files import (
     write_frames,
 )
 from extrap_train.data.sequences import Sequence
+from extrap_train.data.square_frames import make_frames
 from extrap_train.device import is_out_of_memory
 from extrap_train.errors import InputError
 

@@ -7,14 +7,10 @@ from collections import defaultdict
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from jaxtyping import Bool
-
+from extrap_train.data.square_frames import HELD_OUT_EVERY
 from extrap_train.errors import InputError
 
 LOG = logging.getLogger(__name__)
-HELD_OUT_EVERY = 5
-"""A lone sequence holds out every fifth frame."""
 
 
 @dataclass(frozen=True)
@@ -66,11 +62,6 @@ def split_sequences(sequences: Sequence[str], test: Collection[str] | int) -> Sp
             tested += _named(category, names, test)
     train = tuple(s for s in sorted(sequences) if s not in {*tested, *lone})
     return Split(train, tuple(sorted(tested)), tuple(lone))
-
-
-def held_out(frames: int) -> Bool[np.ndarray, " n"]:
-    """Which frames of a lone sequence are for testing."""
-    return np.arange(frames) % HELD_OUT_EVERY == HELD_OUT_EVERY - 1
 
 
 def _named(category: str, names: list[str], test: Collection[str]) -> list[str]:

@@ -1,15 +1,29 @@
-"""`python -m extrap_train`: configuration to task, nothing else."""
+"""`python -m extrap_train`: configuration to task, nothing else.
+
+Preparation builds on this package, so the tasks that train or validate on pairs are given it here.
+"""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from extrap_train.cli import TRAIN, command
-from extrap_train.config import TrainConfig
+from extrap_train.config import PAIR_TASKS, TrainConfig
 from extrap_train.store.outcome import Outcome
 from extrap_train.tasks import task
 
+if TYPE_CHECKING:
+    from extrap_train.data.prepared import PreparedData
+
 
 def _run(config: TrainConfig) -> Outcome | Path | None:
-    return task(config.task)(config)
+    run = task(config.task)
+    return run(config, _prepare) if config.task in PAIR_TASKS else run(config)
+
+
+def _prepare(config: TrainConfig) -> "list[PreparedData]":
+    from data_prep.category import prepare_for_training
+
+    return prepare_for_training(config)
 
 
 def main() -> None:

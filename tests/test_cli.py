@@ -195,7 +195,7 @@ def test_a_run_is_not_removed_before_there_is_another(
 
 
 def test_a_full_disk_anywhere_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    def full(_: object) -> None:
+    def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr("extrap_train.__main__.task", lambda name: full)
@@ -213,7 +213,7 @@ def test_a_full_disk_anywhere_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_p
 def test_a_closed_place_is_called_what_it_is(
     place: str, remedy: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    def closed(_: object) -> None:
+    def closed(*_: object) -> None:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(tmp_path / place))
 
     monkeypatch.setattr("extrap_train.__main__.task", lambda name: closed)
@@ -225,7 +225,7 @@ def test_a_closed_place_is_called_what_it_is(
 def test_a_folder_above_the_output_that_cannot_be_made_is_of_the_output(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    def closed(_: object) -> None:
+    def closed(*_: object) -> None:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(tmp_path / "out"))
 
     monkeypatch.setattr("extrap_train.__main__.task", lambda name: closed)
@@ -258,7 +258,9 @@ def test_a_category_is_added_with_one_file_in_a_folder_of_ones_own(
 ) -> None:
     members: list[str] = []
     task = members.extend
-    monkeypatch.setattr("extrap_train.__main__.task", lambda _: lambda c: task(c.category.members))
+    monkeypatch.setattr(
+        "extrap_train.__main__.task", lambda _: lambda c, _: task(c.category.members)
+    )
     flags = [word.format(own_choices) for word in form.split()]
     words = ["extrap_train", "depth=stereo", *flags, "category=mine"]  # in any order
     monkeypatch.setattr(sys, "argv", words)
@@ -339,7 +341,7 @@ def test_photographs_larger_than_what_is_painted_are_noted(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("extrap_train.__main__.task", lambda _: lambda _: None)
+    monkeypatch.setattr("extrap_train.__main__.task", lambda _: lambda *_: None)
     monkeypatch.setattr(sys, "argv", ["it", "category=hydrant", *words])
     main()
     said = capsys.readouterr().err.splitlines()
@@ -354,7 +356,7 @@ def test_data_prep_takes_threads_for_its_processes(
     words: list[str], workers: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[int | None] = []
-    take = "extrap_train.tasks.prepare.prepare_category"
+    take = "data_prep.category.prepare_category"
     monkeypatch.setattr(take, lambda *_, **options: asked.append(options["workers"]))
     monkeypatch.setattr("data_prep.prep_report.write_report", lambda *_: None)
     monkeypatch.setattr(sys, "argv", ["it", "category=hydrant", *words])

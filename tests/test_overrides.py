@@ -134,7 +134,7 @@ def test_the_jobs_of_a_sweep_are_given_what_was_typed(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     jobs: list[TrainConfig] = []
-    monkeypatch.setattr("extrap_train.__main__.task", lambda _: jobs.append)
+    monkeypatch.setattr("extrap_train.__main__.task", lambda _: lambda job, _: jobs.append(job))
     words = ["it", "-m", "run=1.10,a (1)", "category=hydrant", f"output={tmp_path / 'x y=z'}"]
     monkeypatch.setattr(sys, "argv", [*words, f"hydra.sweep.dir={tmp_path / 'sweep'}"])
     main()

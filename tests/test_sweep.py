@@ -39,7 +39,7 @@ def _trained(tmp_path: Path) -> Callable[[TrainConfig], Path]:
 
 def _sweep(monkeypatch: pytest.MonkeyPatch, task: Fake, folder: Path, *words: str) -> str | None:
     """Run it; what it ends with, None where that is success."""
-    monkeypatch.setattr("extrap_train.__main__.task", lambda name: task)
+    monkeypatch.setattr("extrap_train.__main__.task", lambda name: lambda config, _: task(config))
     monkeypatch.setattr(sys, "argv", ["extrap_train", "-m", *words, f"hydra.sweep.dir={folder}"])
     try:
         main()
@@ -137,7 +137,9 @@ def test_a_row_that_comes_late_or_twice_has_its_place(tmp_path: Path) -> None:
 
 def test_a_single_run_has_no_table(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("extrap_train.__main__.task", lambda name: _trained(tmp_path))
+    monkeypatch.setattr(
+        "extrap_train.__main__.task", lambda name: lambda config, _: _trained(tmp_path)(config)
+    )
     monkeypatch.setattr(sys, "argv", ["extrap_train", "category=apple"])
     main()
     assert not list(tmp_path.rglob("sweep.csv"))

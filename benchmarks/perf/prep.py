@@ -15,7 +15,6 @@ from torch import Tensor
 
 from benchmarks.perf.timing import Row, compare
 from data_prep.correct import correct_pair, draw
-from data_prep.frames import make_frames
 from data_prep.pairs import choose_pairs
 from data_prep.preparation import prepare
 from data_prep.synthesize import synthesize
@@ -28,6 +27,7 @@ from extrap_train.data.frame_files import (
     read_camera_table,
     write_frames,
 )
+from extrap_train.data.square_frames import make_frames
 from extrap_train.depth import DepthMap, DepthSource
 from extrap_train.depth.stereo import PlaneSweepStereo
 from extrap_train.jobs import Launcher

@@ -16,7 +16,7 @@ from extrap_train.config.benchmark import (
     TableConfig,
 )
 from extrap_train.config.checks import notes, required_file, validate, validate_model
-from extrap_train.config.commands import TASKS, DataPrepConfig, TrainConfig
+from extrap_train.config.commands import PAIR_TASKS, TASKS, DataPrepConfig, TrainConfig
 from extrap_train.config.completion import CompletionConfig, ConfidenceConfig, SplatsConfig
 from extrap_train.config.data import (
     CATEGORIES,
@@ -65,6 +65,7 @@ __all__ = [
     "LPIPS_NETS",
     "MISSING",
     "NEAREST_ALONE",
+    "PAIR_TASKS",
     "TASKS",
     "AlikedMatcherConfig",
     "CapturesConfig",

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from extrap_train.config.commands import DataPrepConfig, TrainConfig
+from extrap_train.config.commands import PAIR_TASKS, DataPrepConfig, TrainConfig
 from extrap_train.config.data import Co3dConfig, PrepConfig, SyntheticConfig
 from extrap_train.config.model import NEAREST_ALONE, ModelConfig, SamplerConfig
 from extrap_train.config.options import check_options
@@ -14,8 +14,6 @@ from extrap_train.errors import InputError
 _MAX_LEVELS, _MAX_WIDTH = 8, 8192
 _MAX_LATENTS, _MAX_WARP = 256, 4096
 """Sides of the latents and of the warp: beyond them a view takes tens of gigabytes."""
-_ON_PAIRS = ("category", "validate")
-"""Tasks that prepare pairs of photographs."""
 
 
 def validate(config: TrainConfig | DataPrepConfig) -> None:
@@ -30,7 +28,7 @@ def validate(config: TrainConfig | DataPrepConfig) -> None:
     if isinstance(config, TrainConfig):
         _check_intervals(config.trainer)
         _check_model(config.model)
-        if config.task in _ON_PAIRS:
+        if config.task in PAIR_TASKS:
             _check_pairs(config.model, config.prep)
         _check_completion(config)
         _check_sampler_of(config)
@@ -46,7 +44,7 @@ def notes(config: TrainConfig | DataPrepConfig) -> list[str]:
     if not (isinstance(config, TrainConfig) and isinstance(config.data, SyntheticConfig)):
         return []
     model, size = config.model, config.data.image_size
-    if config.task not in _ON_PAIRS or size <= model.warp_size:
+    if config.task not in PAIR_TASKS or size <= model.warp_size:
         return []
     return [
         f"data.image_size={size}: photographs are reduced to prep.image_size={model.warp_size} and "

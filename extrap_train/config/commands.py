@@ -22,6 +22,8 @@ TASKS = {
     "view": "make one view of a scene (pose=) or a walk around it (orbit=)",
 }
 """What each value of `task=` does."""
+PAIR_TASKS = ("category", "validate")
+"""Tasks that prepare pairs of photographs."""
 
 
 @dataclass

@@ -5,8 +5,10 @@ from pathlib import Path
 import torch
 
 from extrap_train.config import (
+    AlikedMatcherConfig,
     DatasetDepthConfig,
     DepthConfig,
+    LoftrMatcherConfig,
     Mast3rConfig,
     MonocularConfig,
     StereoConfig,
@@ -48,3 +50,16 @@ def depth_source(config: DepthConfig, device: torch.device | None = None) -> Dep
             raise InputError(
                 f"depth={config.name}: unknown; choose dataset, stereo, mast3r or monocular"
             )
+
+
+def weight_files(options: object) -> list[Path]:
+    """The files of weights that a depth source or a matcher reads."""
+    match options:
+        case Mast3rConfig() | LoftrMatcherConfig() | AlikedMatcherConfig():
+            return [Path(options.checkpoint or "")]
+        case MonocularConfig():
+            from extrap_train.depth.depth_anything import files_read
+
+            return [*files_read(options.model), *weight_files(options.matcher)]
+        case _:
+            return []

@@ -2,17 +2,16 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from extrap_train.store.outcome import Outcome
 
 
-def task(name: str) -> Callable[[Any], Outcome | Path | None]:
+def task(name: str) -> Callable[..., Outcome | Path | None]:
     """The function of the task called `name`, imported only now: `--help` needs no torch.
 
     It returns the folder of its result, where there is a `summary.json` in it.
     """
     from importlib import import_module
 
-    run: Callable[[Any], Outcome | Path | None] = import_module(f"extrap_train.tasks.{name}").run
+    run: Callable[..., Outcome | Path | None] = import_module(f"extrap_train.tasks.{name}").run
     return run

@@ -48,11 +48,11 @@ from extrap_train.store.manifest import Manifest
 from extrap_train.store.outcome import Outcome
 from extrap_train.tasks.leakage import require_unseen
 from extrap_train.tasks.results import Results, draw_curve, draw_views, write_results
-from extrap_train.tasks.training_data import data_module, prepared_data, validation_names
+from extrap_train.tasks.training_data import Prepare, data_module, validation_names
 from extrap_train.terminal import terminal
 
 
-def run(config: TrainConfig) -> Outcome:
+def run(config: TrainConfig, prepare: Prepare) -> Outcome:
     """Train a category model and leave weights, metrics, pictures and `summary.json` behind.
 
     Nothing of a run is begun or removed before its options, its start and its data are known to be
@@ -66,7 +66,7 @@ def run(config: TrainConfig) -> Outcome:
     require_same_options(folder, config)  # before what takes minutes
     model = _model(config)
     started = time.perf_counter()
-    prepared = prepared_data(config)
+    prepared = prepare(config)
     data = data_module(config, prepared)
     seconds = {"prepare": time.perf_counter() - started}
     manifest = run_manifest(config, prepared)

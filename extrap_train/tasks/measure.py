@@ -19,7 +19,7 @@ from extrap_train.tasks.category import quieten_lightning
 from extrap_train.tasks.leakage import require_unseen
 from extrap_train.tasks.results import Results, write_results
 from extrap_train.tasks.saved_model import require_as_said
-from extrap_train.tasks.training_data import data_module, prepared_data, validation_names
+from extrap_train.tasks.training_data import Prepare, data_module, validation_names
 from extrap_train.terminal import terminal
 
 
@@ -32,10 +32,10 @@ class RunData:
     """To prepare them."""
 
     @classmethod
-    def of(cls, trained: RunFolder, config: TrainConfig) -> "RunData":
+    def of(cls, trained: RunFolder, config: TrainConfig, prepare: Prepare) -> "RunData":
         """InputError where the options and what lies there today are not what it was trained on."""
         started = time.perf_counter()
-        prepared = prepared_data(config)
+        prepared = prepare(config)
         before = read_manifest(trained.path, "train another run=NAME")
         inputs, split = trained_on(config, prepared)
         today = replace(before, inputs={**before.inputs, **inputs}, split=split)

@@ -11,11 +11,11 @@ import torch
 from lightning.fabric import Fabric
 from rich.console import Console
 
-from data_prep.scene_views import target_views
 from extrap_train.config import TrainConfig, dotted, sampler_for
 from extrap_train.data.examples import linspace_indices
 from extrap_train.data.scene import scene_address
 from extrap_train.data.scene_pairs import AdaptationPairs, adaptation_pairs
+from extrap_train.data.scene_views import target_views
 from extrap_train.data.sequences import Frame, Sequence
 from extrap_train.device import advise_on_adapting_memory
 from extrap_train.diffusion.adaptation import Adaptation, adapt

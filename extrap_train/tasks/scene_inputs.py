@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass, replace
 
-from data_prep.scene_views import choose_frames, input_views
 from extrap_train.config import SyntheticConfig, TrainConfig
 from extrap_train.data.photographs import CATEGORY
 from extrap_train.data.scene import open_scene
+from extrap_train.data.scene_views import choose_frames, input_views
 from extrap_train.data.sequences import Frame, Sequence
 from extrap_train.depth.build import depth_source
 from extrap_train.errors import InputError

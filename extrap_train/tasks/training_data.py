@@ -1,30 +1,15 @@
 """The pairs that a category is trained on and measured on."""
 
-from pathlib import Path
+from collections.abc import Callable
 
 from extrap_train.config import TrainConfig
 from extrap_train.data.examples import ExampleReader
 from extrap_train.data.module import PairModule
 from extrap_train.data.prepared import PreparedData
 from extrap_train.errors import InputError
-from extrap_train.tasks.prepare import check_members, prepare_category
 
-
-def prepared_data(config: TrainConfig) -> list[PreparedData]:
-    """Every member category, prepared now or before."""
-    check_members(config.category, config.data)
-    return [
-        prepare_category(
-            member,
-            config.data,
-            config.depth,
-            config.prep,
-            output=Path(config.output),
-            workers=config.threads,
-            matcher=config.matcher,
-        )
-        for member in config.category.members
-    ]
+Prepare = Callable[[TrainConfig], list[PreparedData]]
+"""Prepares every member of the category, or finds what was prepared before."""
 
 
 def data_module(config: TrainConfig, prepared: list[PreparedData]) -> PairModule:

@@ -13,12 +13,13 @@ from extrap_train.store.manifest import MANIFEST, Manifest
 from extrap_train.store.outcome import Outcome
 from extrap_train.store.records import write_record
 from extrap_train.tasks.measure import RunData, measure
+from extrap_train.tasks.training_data import Prepare
 
 
-def run(config: TrainConfig) -> Outcome:
+def run(config: TrainConfig, prepare: Prepare) -> Outcome:
     """Sample the held-out views with the run's model; leaves the scores in the run's folder."""
     trained = existing_run(config)
-    data = RunData.of(trained, config)
+    data = RunData.of(trained, config, prepare)
     steps = Finished.read(trained).steps
     model = load_model(trained.model)
     sampler = sampler_for(config.sampler, model.config)

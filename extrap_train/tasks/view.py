@@ -11,8 +11,6 @@ from pathlib import Path
 import torch
 from rich.console import Console
 
-from data_prep.frames import object_square
-from data_prep.scene_views import choose_frames, input_views
 from extrap_train.config import (
     DatasetDepthConfig,
     DepthConfig,
@@ -23,7 +21,9 @@ from extrap_train.config import (
 )
 from extrap_train.data.posed import read_cameras
 from extrap_train.data.scene import open_scene
+from extrap_train.data.scene_views import choose_frames, input_views
 from extrap_train.data.sequences import Sequence
+from extrap_train.data.square_frames import object_square
 from extrap_train.depth.build import depth_source
 from extrap_train.device import fastest_device
 from extrap_train.diffusion.generator import DiffusionGenerator, GeneratedViews

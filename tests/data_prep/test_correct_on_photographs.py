@@ -12,11 +12,11 @@ import torch
 from torch.nn import functional
 
 from data_prep import correct
+from data_prep.category import prepare_category
 from data_prep.correct import Correction, correct_pair
 from extrap_train.config import Co3dConfig, FlowMatcherConfig, PrepConfig, StereoConfig
 from extrap_train.data.prepared import PreparedData
 from extrap_train.matching.build import matcher
-from extrap_train.tasks.prepare import prepare_category
 
 GATES = (0.0, 0.01, 0.02, 0.05)
 Picture = torch.Tensor

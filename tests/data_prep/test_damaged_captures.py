@@ -13,7 +13,7 @@ import torch
 from captures import frame_entries, replace_frame_entries, write_capture
 from orbits import capture, even, ring
 
-from data_prep.frames import make_frames
+from data_prep.category import prepare_category
 from extrap_train.config import (
     Co3dConfig,
     DatasetDepthConfig,
@@ -23,10 +23,10 @@ from extrap_train.config import (
     StereoConfig,
 )
 from extrap_train.data.prepared import PreparedData
+from extrap_train.data.square_frames import make_frames
 from extrap_train.depth import DepthMap
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError
-from extrap_train.tasks.prepare import prepare_category
 from extrap_train.views import View
 
 

@@ -17,6 +17,7 @@ import torch
 from captures import write_capture
 from kornia.feature import LoFTR
 
+from data_prep.category import prepare_category
 from data_prep.model_cache import PrepModels, release_models
 from data_prep.sequence_job import PrepContext, SequenceJob
 from extrap_train.config import (
@@ -31,7 +32,6 @@ from extrap_train.data.sequences import Sequence
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.depth.mast3r.network import Architecture, PointMapNetwork
 from extrap_train.errors import InputError
-from extrap_train.tasks.prepare import prepare_category
 
 THIN = Architecture(
     encoder_width=16, encoder_heads=2, decoder_width=8, decoder_heads=2, descriptor_width=1

@@ -12,13 +12,13 @@ import torch
 from orbits import capture, even, ring, textured_capture
 
 from data_prep import pairs
-from data_prep.frames import block_median, object_square
 from data_prep.model_cache import PrepModels
 from data_prep.preparation import prepare
 from data_prep.sequence_job import PrepContext, SequenceJob, prepare_sequence
 from extrap_train.config import FlowMatcherConfig, PrepConfig
 from extrap_train.data import frame_files
 from extrap_train.data.prepared import PreparedData
+from extrap_train.data.square_frames import block_median, object_square
 from extrap_train.depth import DepthMap, DepthSource
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError

@@ -7,6 +7,7 @@ import pytest
 from captures import write_capture
 from orbits import capture, even, ring
 
+from data_prep.category import prepare_category
 from data_prep.preparation import prepare
 from extrap_train.config import (
     Co3dConfig,
@@ -21,7 +22,6 @@ from extrap_train.config import (
 from extrap_train.data.frame_files import frames_folder, pairs_folder
 from extrap_train.data.prepared import PreparedData
 from extrap_train.data.sequences import Sequence
-from extrap_train.tasks.prepare import prepare_category
 
 OPTIONS = PrepConfig(image_size=16)
 HELD_OUT = [4, 9, 14, 19]

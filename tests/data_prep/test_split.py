@@ -3,7 +3,8 @@ import json
 import numpy as np
 import pytest
 
-from data_prep.split import held_out, split_sequences
+from data_prep.split import split_sequences
+from extrap_train.data.square_frames import held_out
 from extrap_train.errors import InputError
 
 NAMES = [f"cup/{i:04d}" for i in range(20)] + [f"book/{i:04d}" for i in range(12)]

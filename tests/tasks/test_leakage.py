@@ -97,7 +97,6 @@ def test_a_model_that_says_nothing_is_taken_at_that(tmp_path: Path) -> None:
 def test_a_training_that_would_hold_out_what_its_start_has_seen_is_not_begun(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(category, "prepared_data", lambda _: [])
     monkeypatch.setattr(category, "data_module", lambda *_: None)
     monkeypatch.setattr(category, "run_manifest", lambda *_: _split(7))
     config = TrainConfig(
@@ -109,5 +108,5 @@ def test_a_training_that_would_hold_out_what_its_start_has_seen_is_not_begun(
         output=str(tmp_path / "out"),
     )
     with pytest.raises(InputError, match="start=base was trained on 0005, 0006"):
-        category.run(config)
+        category.run(config, lambda _: [])
     assert not (tmp_path / "out").exists()

@@ -21,11 +21,19 @@ from extrap_train.runs import RunFolder, trained_on
 from extrap_train.store.manifest import MANIFEST, Manifest
 from extrap_train.store.records import write_record
 from extrap_train.tasks import validate
+from extrap_train.tasks.training_data import Prepare
 
 
 def _prepared(folder: Path, test_names: set[str]) -> PreparedData:
     captures = [capture(ring(even(24)), f"{index:04d}") for index in range(3)]
     return prepared_captures(folder, captures, test_names)
+
+
+@pytest.fixture
+def prepare(tmp_path: Path) -> Prepare:
+    """Another sequence is held out today."""
+    today = [_prepared(tmp_path / "today", {"0001"})]
+    return lambda _: today
 
 
 @pytest.fixture
@@ -40,10 +48,7 @@ def run(tmp_path: Path, config: TrainConfig) -> RunFolder:
 
 
 @pytest.fixture
-def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> TrainConfig:
-    """Of a command for which another sequence is held out today."""
-    today = [_prepared(tmp_path / "today", {"0001"})]
-    monkeypatch.setattr("extrap_train.tasks.measure.prepared_data", lambda config: today)
+def config(tmp_path: Path) -> TrainConfig:
     return TrainConfig(
         category=CategoryConfig("cup", ["cup"]),
         data=Co3dConfig(root=str(tmp_path)),
@@ -56,17 +61,17 @@ def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> TrainConfig:
 
 
 def test_a_run_that_has_seen_what_is_held_out_today_is_not_measured(
-    run: RunFolder, config: TrainConfig
+    run: RunFolder, config: TrainConfig, prepare: Prepare
 ) -> None:
     before = sorted(run.path.rglob("*"))
     with pytest.raises(InputError, match=r"split of cup \(2 .* 0000\).* or measure another"):
-        validate.run(config)
+        validate.run(config, prepare)
     assert sorted(run.path.rglob("*")) == before
 
 
 def test_a_run_that_does_not_say_what_it_has_seen_is_not_measured(
-    run: RunFolder, config: TrainConfig
+    run: RunFolder, config: TrainConfig, prepare: Prepare
 ) -> None:
     (run.path / MANIFEST).unlink()
     with pytest.raises(InputError, match=r"manifest\.json: .*run=NAME"):
-        validate.run(config)
+        validate.run(config, prepare)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from orbits import capture, even, ring
 
-from data_prep.scene_views import choose_frames, input_views, target_views
+from extrap_train.data.scene_views import choose_frames, input_views, target_views
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError
 

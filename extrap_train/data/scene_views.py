@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from data_prep.frames import make_frames, object_square
 from extrap_train.data.sequences import Frame, Sequence
+from extrap_train.data.square_frames import make_frames, object_square
 from extrap_train.depth import DepthSource
 from extrap_train.errors import InputError, did_you_mean
 from extrap_train.geometry.viewpoints import camera_centers, farthest_point_sample

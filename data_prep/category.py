@@ -27,6 +27,7 @@ from extrap_train.config import (
     MatcherConfig,
     PrepConfig,
     SyntheticConfig,
+    TrainConfig,
     placed,
 )
 from extrap_train.data.co3d import read_category, require_category
@@ -96,6 +97,23 @@ def prepare_category(
             retry=retry,
             source=asdict(data),
         )
+
+
+def prepare_for_training(config: TrainConfig) -> list[PreparedData]:
+    """The pairs of every member of the category, prepared now or before."""
+    check_members(config.category, config.data)
+    return [
+        prepare_category(
+            member,
+            config.data,
+            config.depth,
+            config.prep,
+            output=Path(config.output),
+            workers=config.threads,
+            matcher=config.matcher,
+        )
+        for member in config.category.members
+    ]
 
 
 def is_corrected(data: DataConfig, depth: DepthConfig, prep: PrepConfig) -> bool:

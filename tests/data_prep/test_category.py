@@ -5,8 +5,8 @@ from pathlib import Path
 
 from captures import write_capture
 
+from data_prep.category import _said, prepare_category
 from extrap_train.config import Co3dConfig, DatasetDepthConfig, FlowMatcherConfig, PrepConfig
-from extrap_train.tasks.prepare import _said, prepare_category
 
 
 def test_a_set_list_says_what_is_trained_and_tested_on(tmp_path: Path) -> None:

@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from data_prep.split import held_out
 from extrap_train.data.frame_files import SequenceFrames
 from extrap_train.data.images import to_eight_bits
 from extrap_train.data.paths import file_stamp
@@ -20,6 +19,8 @@ from extrap_train.depth import DepthSource, NoDepthError
 from extrap_train.errors import InputError
 from extrap_train.views import View, stack_cameras
 
+HELD_OUT_EVERY = 5
+"""A lone sequence holds out every fifth frame."""
 LEAST_KNOWN_SHARE = 0.25
 """Of the finer depths under a pixel, for it to have one."""
 MOST_UNUSABLE_SHARE = 0.1
@@ -58,6 +59,11 @@ class CaptureKeys:
         """A hash of what frames are made from; `depth` says by what theirs is found."""
         made_from = [METHOD, image_size, depth, self.content, self.files]
         return hashlib.sha256(json.dumps(made_from).encode()).hexdigest()
+
+
+def held_out(frames: int) -> Bool[np.ndarray, " n"]:
+    """Which frames of a lone sequence are for testing."""
+    return np.arange(frames) % HELD_OUT_EVERY == HELD_OUT_EVERY - 1
 
 
 def make_frames(
