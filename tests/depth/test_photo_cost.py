@@ -43,4 +43,6 @@ def test_chunks_do_not_change_the_cost(monkeypatch):
     inverse_depth = torch.linspace(0.3, 0.6, 7)[:, None, None].expand(7, 96, 96)
     at_once = PhotoCost(view, neighbours)(inverse_depth)
     monkeypatch.setattr(photo_cost, "CHUNK_ELEMENTS", 1)
-    assert torch.equal(PhotoCost(view, neighbours)(inverse_depth), at_once)
+    chunked = PhotoCost(view, neighbours)(inverse_depth)
+    # Vectorised kernels may round the ends of tensors otherwise than their middles.
+    torch.testing.assert_close(chunked, at_once, atol=1e-5, rtol=0)

@@ -65,8 +65,9 @@ def test_who_is_told_of_the_nearest_alone_makes_its_warp_as_of_one_view(
     made = several.generate(views, query, ["a"])
     alone = one.generate(views[:1], query, ["a"])
     assert made.references == [(0,)]
-    assert torch.equal(made.warp.image, alone.warp.image)
-    assert torch.equal(made.images, alone.images)
+    # Kernels may round otherwise in tensors of another shape.
+    torch.testing.assert_close(made.warp.image, alone.warp.image, atol=1e-5, rtol=0)
+    torch.testing.assert_close(made.images, alone.images, atol=1e-5, rtol=0)
 
 
 def test_seed_and_name_choose_the_noise(config: ModelConfig) -> None:

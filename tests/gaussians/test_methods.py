@@ -63,7 +63,8 @@ def test_targets_change_nothing_that_is_learnt(name: str) -> None:
     for key, value in first.parameters.tensors().items():
         assert value.equal(second.parameters.tensors()[key]), key
     assert first.record == second.record
-    assert first.render(inputs.targets)[0].equal(second.render(other.targets)[1])
+    alone, among = first.render(inputs.targets)[0], second.render(other.targets)[1]
+    torch.testing.assert_close(alone, among, atol=1e-5, rtol=0)  # batches round otherwise
 
 
 @each_method

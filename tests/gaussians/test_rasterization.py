@@ -116,7 +116,8 @@ def test_not_a_number_is_not_drawn():
     worse.opacities[32], worse.means[33, 2] = torch.nan, torch.inf
     inputs = leaves(worse, camera_pose(), torch.float32)
     image = draw(inputs, degree=0)[0]
-    assert torch.equal(image, whole)
+    # Of more Gaussians: vectorised kernels may round a tensor's end otherwise than its middle.
+    torch.testing.assert_close(image, whole, atol=1e-5, rtol=0)
     image.sum().backward()
     assert all(x.grad.isfinite().all() for x in inputs)
 
@@ -177,7 +178,7 @@ def test_cameras_are_independent_and_screen_gradients_are_kept():
     found["means2d"].retain_grad()
     image[1].sum().backward()
     single = draw([*inputs[:5], poses[1]], "RGB", 0)[0]
-    assert torch.equal(image[1], single[0])
+    torch.testing.assert_close(image[1], single[0], atol=1e-5, rtol=0)  # batches round otherwise
     assert found["radii"].dtype == torch.int32
     assert not found["means2d"].grad[0].any()
     drawn = (found["radii"][1] > 0).all(1)

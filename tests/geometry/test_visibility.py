@@ -152,7 +152,7 @@ def test_both_implementations_agree():
     # As above: rounding moves points over the borders of pixels.
     assert ((fast.unobserved - plain.unobserved).abs() > 1e-4).float().mean() < 0.01
     assert ((fast.entry - plain.entry).nan_to_num(0).abs() > 1e-3).float().mean() < 0.01
-    assert torch.equal(fast.entry.isinf(), plain.entry.isinf())
+    assert (fast.entry.isinf() != plain.entry.isinf()).float().mean() < 0.01
 
 
 @pytest.mark.parametrize("query_deg", [90, 120, 150])
