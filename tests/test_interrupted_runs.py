@@ -80,12 +80,13 @@ def _results(output: Path) -> dict[str, object]:
     places = ["train/*/*/seed*", *_PREPARED_FOLDERS, "greys/cells"]
     files = [path for place in places for path in output.glob(f"{place}/**/*") if path.is_file()]
     for path in sorted(files):
-        part, name = path.relative_to(output).parts[0], str(path.relative_to(output))
-        wanted = path.suffix in (".safetensors", ".png")
-        wanted |= path.name in ("metrics.csv", "validation.csv")
-        wanted |= part in _PREPARED_FOLDERS and path.suffix != ".lock"
-        if wanted:
+        name = str(path.relative_to(output))
+        if path.suffix == ".parquet":  # without the identity of the files that it was made from
+            found[name] = pd.read_parquet(path).to_csv()
+        elif path.suffix in (".safetensors", ".png", ".npy"):
             found[name] = path.read_bytes()
+        elif path.name in ("metrics.csv", "validation.csv"):
+            found[name] = path.read_text()
     for table in ("sweep/sweep.csv", "greys/greys.csv"):
         if (output / table).is_file():
             rows = pd.read_csv(output / table)

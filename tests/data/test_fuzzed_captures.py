@@ -51,16 +51,16 @@ def within_limits() -> Iterator[None]:
     def late(*_: object) -> None:
         raise TimeoutError(f"took more than {SECONDS} s")
 
-    before, old = resource.getrlimit(resource.RLIMIT_DATA), signal.signal(signal.SIGALRM, late)
+    before, old = resource.getrlimit(resource.RLIMIT_DATA), signal.signal(signal.SIGPROF, late)
     resource.setrlimit(resource.RLIMIT_DATA, (BYTES, before[1]))
-    signal.alarm(SECONDS)
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)  # of this process, however busy the machine
     _watched.append(True)
     try:
         yield
     finally:
         _watched.clear()
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, old)
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, old)
         resource.setrlimit(resource.RLIMIT_DATA, before)
 
 

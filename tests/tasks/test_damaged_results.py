@@ -180,7 +180,7 @@ def test_damage_is_one_line_and_costs_neither_memory_nor_time(kind: str, tmp_pat
         file = files[number % len(files)]
         whole = file.read_bytes()
         file.write_bytes(_damaged(whole, file.name, rng, marker))
-        started, lines = time.monotonic(), [""]
+        started, lines = time.process_time(), [""]
         try:
             read()
         except InputError as error:
@@ -189,7 +189,7 @@ def test_damage_is_one_line_and_costs_neither_memory_nor_time(kind: str, tmp_pat
         finally:
             file.write_bytes(whole)
         assert len(lines) == 1
-        assert time.monotonic() - started < MOST_SECONDS
+        assert time.process_time() - started < MOST_SECONDS
         assert not marker.exists()
     assert refused > INPUTS_PER_KIND // 4
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < MOST_KIB
