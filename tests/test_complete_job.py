@@ -14,9 +14,8 @@ import pytest
 from plyfile import PlyData
 
 from extrap_train.data.scene import open_scene
-from extrap_train.gaussians.drawing import draw
 from extrap_train.gaussians.ply import read_splats
-from extrap_train.gaussians.rasterization import rasterizer
+from extrap_train.gaussians.rasterize import draw, rasterizer
 from extrap_train.metrics import psnr
 
 _TINY = [

@@ -1,21 +1,27 @@
 """FSGS (Zhu et al., 2024): few-shot view synthesis by unpooling and monocular depth."""
 
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from benchmarks.methods.gaussian_method import GaussianMethod
+from benchmarks.methods.gaussian_method import GaussianMethod, monocular_source, prior_depths
 from extrap_train.errors import InputError
-from extrap_train.gaussians.depth_losses import pearson_depth_loss
-from extrap_train.gaussians.drawing import Drawing
-from extrap_train.gaussians.priors import monocular_source, prior_depths
-from extrap_train.gaussians.pseudo_views import pseudo_camera
+from extrap_train.gaussians.init import nearest_neighbours
+from extrap_train.gaussians.losses import pearson_depth_loss
+from extrap_train.gaussians.model import GaussianParameters, from_tensors
+from extrap_train.gaussians.rasterize import Drawing
 from extrap_train.gaussians.recipe import Recipe, Training
 from extrap_train.gaussians.scene import TrainingScene
-from extrap_train.gaussians.unpool import Pairing, unpooled
-from extrap_train.views import View
+from extrap_train.views import Camera, View
+
+NEIGHBOURS = 3
+
+Pairing = Literal["paper", "released"]
 
 
 @dataclass(frozen=True)
@@ -114,3 +120,99 @@ class FsgsRecipe(Recipe):
         training.statistics.follow(all_kept, len(new))
         if limited:
             self.scene.record["unpooling"] = f"stopped at {options.max_gaussians} Gaussians"
+
+
+def unpooled(
+    parameters: GaussianParameters, proximity: float, scale: float, pairing: Pairing, most: int
+) -> tuple[GaussianParameters, bool]:
+    """The Gaussians that fill the gaps between those already there, the most isolated sources'
+    first and at most `most` of them; and whether there would have been more.
+
+    A Gaussian is a source where the mean squared distance to its three neighbours exceeds
+    `proximity` and its largest scale `scale`. On each edge from a source to a neighbour a new one
+    is put in the middle, with the neighbour's scale and opacity, no rotation, and a colour of zero.
+    `released` pairs as the published code does: sources repeat as 0 1 0 1 0 1 while neighbours
+    stand as 0 0 0 1 1 1, so that with several sources most edges lead to a stranger.
+    """
+    distance, index = nearest_neighbours(parameters.means, NEIGHBOURS)
+    gap = distance.square().mean(1)
+    sources = isolated(parameters, gap, proximity, scale)
+    source, target = edges(sources, index, pairing)
+    limited = len(source) > most
+    source, target = source[:most], target[:most]
+    means = parameters.means.detach()
+    count = len(source)
+    quats = torch.zeros(count, 4).to(means)
+    quats[:, 0] = 1
+    new = from_tensors(
+        {
+            "means": (means[source] + means[target]) / 2,
+            "log_scales": parameters.log_scales.detach()[target],
+            "quats": quats,
+            "opacity_logits": parameters.opacity_logits.detach()[target],
+            "sh_dc": torch.zeros_like(parameters.sh_dc[target]),
+            "sh_rest": torch.zeros_like(parameters.sh_rest[target]),
+        }
+    )
+    return new, limited
+
+
+def isolated(
+    parameters: GaussianParameters, gap: Float[Tensor, " n"], proximity: float, scale: float
+) -> Int[Tensor, " s"]:
+    """Numbers of the Gaussians that are large and far from their neighbours, farthest first."""
+    chosen = (gap > proximity) & (parameters.scales.detach().amax(1) > scale)
+    order = gap.argsort(descending=True, stable=True)
+    return order[chosen[order]]
+
+
+def edges(
+    sources: Int[Tensor, " s"], neighbours: Int[Tensor, "n k"], pairing: Pairing
+) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"]]:
+    """Both ends of every new edge, as Gaussian numbers."""
+    targets = neighbours[sources].flatten()
+    count = neighbours.shape[1]
+    if pairing == "paper":
+        return sources.repeat_interleave(count), targets
+    return sources.repeat(count), targets
+
+
+def pseudo_camera(
+    cameras: Sequence[Camera], generator: torch.Generator, jitter: float = 0.05
+) -> Camera:
+    """A camera on the way from one input to the input nearest to it, looking at the same place.
+
+    The position moves on the arc around the origin (the frame's centre) and is shifted by `jitter`
+    times its distance at random; the viewing directions are averaged in the same share.
+    """
+    first = int(torch.randint(len(cameras), (1,), generator=generator))
+    centers = torch.stack([camera.center for camera in cameras])
+    distance = (centers - centers[first]).norm(dim=-1)
+    distance[first] = math.inf
+    a, b = cameras[first], cameras[int(distance.argmin())]
+    share = float(torch.rand((), generator=generator))
+    center = _on_arc(a.center, b.center, share)
+    noise = torch.randn(3, generator=generator).to(center)
+    center = center + jitter * center.norm() * noise
+    forward = (1 - share) * a.forward + share * b.forward
+    down = (1 - share) * a.world_to_cam[1, :3] + share * b.world_to_cam[1, :3]
+    return replace(a, world_to_cam=looking(center, forward, down))
+
+
+def _on_arc(a: Float[Tensor, "3"], b: Float[Tensor, "3"], share: float) -> Float[Tensor, "3"]:
+    straight = (1 - share) * a + share * b
+    radius = (1 - share) * a.norm() + share * b.norm()
+    return straight / straight.norm().clamp_min(1e-6) * radius
+
+
+def looking(
+    center: Float[Tensor, "3"], forward: Float[Tensor, "3"], down: Float[Tensor, "3"]
+) -> Float[Tensor, "4 4"]:
+    """world_to_cam of a camera at `center`; `down` need not be square to `forward`."""
+    z = forward / forward.norm()
+    x = torch.linalg.cross(down, z)
+    x = x / x.norm()
+    rotation = torch.stack([x, torch.linalg.cross(z, x), z])
+    world_to_cam = torch.eye(4).to(center)
+    world_to_cam[:3, :3], world_to_cam[:3, 3] = rotation, -rotation @ center
+    return world_to_cam

@@ -6,14 +6,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis, photographs_used
+from extrap_train.depth import DepthSource
+from extrap_train.depth.surrogate import AffineSurrogate
+from extrap_train.errors import InputError
+from extrap_train.gaussians.fit import Fit, fit
+from extrap_train.gaussians.init import Points, parameters_from_points
 from extrap_train.gaussians.options import GaussianOptions
-from extrap_train.gaussians.parameters import parameters_from_points
-from extrap_train.gaussians.points import Points
 from extrap_train.gaussians.recipe import Recipe
 from extrap_train.gaussians.scene import TrainingScene, training_scene
-from extrap_train.gaussians.trainer import Fit, fit
 
 
 @dataclass(frozen=True)
@@ -57,3 +61,32 @@ class GaussianMethod(GaussianOptions, ABC):
         scene = training_scene(inputs.views, inputs.depth_source, inputs.seed)
         recipe = Recipe(self, scene)
         recipe.draw(learnt, recipe.camera(0)).image.sum().backward()
+
+
+def monocular_source(scene: TrainingScene, name: str) -> DepthSource:
+    """`surrogate` (the scene's depth source under an unknown affine map) or `depth_source` itself.
+
+    The second is for benchmarks whose depth source is a monocular network. The record says which.
+    """
+    match name:
+        case "surrogate":
+            scene.record["monocular"] = "surrogate: the depth source under an unknown affine map"
+            return AffineSurrogate(scene.depth_source, scene.seed)
+        case "depth_source":
+            scene.record["monocular"] = "the depth source"
+            return scene.depth_source
+        case _:
+            raise InputError(f"monocular={name} is unknown; known: surrogate, depth_source")
+
+
+def prior_depths(
+    scene: TrainingScene, source: DepthSource, device: str
+) -> list[Float[Tensor, "h w"]]:
+    """Depth of every input view up to an affine map, on `device`; 0 where it is unknown.
+
+    The record says in how many inputs there is any: in others, depth losses are silent.
+    """
+    priors = [found.reliable() for found in source.depth_maps(scene.given)]
+    known = sum(bool((prior > 0).any()) for prior in priors)
+    scene.record["monocular depth"] = f"in {known} of {len(priors)} inputs"
+    return [prior.to(device) for prior in priors]

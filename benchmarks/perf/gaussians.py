@@ -9,8 +9,8 @@ from torch import Tensor
 from benchmarks.perf.gaussians_reference import rasterize_reference
 from benchmarks.perf.timing import Row, compare
 from benchmarks.perf.warp import orbit_camera
-from extrap_train.gaussians.photometric import photograph, photometric_loss
-from extrap_train.gaussians.rasterization import Backend, rasterizer
+from extrap_train.gaussians.losses import photograph, photometric_loss
+from extrap_train.gaussians.rasterize import Backend, rasterizer
 
 SIZES = (128, 256)
 COUNTS = (10_000, 50_000)

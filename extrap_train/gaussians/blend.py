@@ -8,19 +8,17 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from extrap_train.gaussians.arrays import array
-from extrap_train.gaussians.blend_backward_numba import blend_backward
-from extrap_train.gaussians.blend_numba import blend
-from extrap_train.gaussians.packed_numba import (
+from extrap_train.gaussians.blend_numba import blend, blend_backward
+from extrap_train.gaussians.projection import Ellipses, array
+from extrap_train.gaussians.tiles_numba import (
     CHANNELS,
     COLUMNS,
     MOMENTS,
     REACH,
     pack,
+    sort_into_tiles,
     unpack,
 )
-from extrap_train.gaussians.projection import Ellipses
-from extrap_train.gaussians.tiles_numba import sort_into_tiles
 
 
 def blend_ellipses(

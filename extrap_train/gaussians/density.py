@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
+from extrap_train.gaussians.model import GaussianParameters, from_tensors
 from extrap_train.gaussians.optimiser import GaussianOptimiser
 from extrap_train.gaussians.options import GaussianOptions
-from extrap_train.gaussians.parameters import GaussianParameters, from_tensors
 
 SPLIT_SHRINK = 1.6
 """Each half of a split Gaussian is this much smaller: 0.8 times their number, 2."""

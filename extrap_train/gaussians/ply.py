@@ -15,7 +15,7 @@ from plyfile import PlyData, PlyElement, PlyParseError
 from torch.nn import functional
 
 from extrap_train.errors import InputError
-from extrap_train.gaussians.gaussians import Gaussians
+from extrap_train.gaussians.model import Gaussians
 from extrap_train.store.atomic import write_atomic
 
 _LEAST = 1e-6

@@ -9,13 +9,14 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from extrap_train.gaussians.arrays import array
-from extrap_train.gaussians.projection_numba import (
-    pose_blocks,
-    project_backward,
-    project_forward,
-)
+from extrap_train.gaussians.projection_numba import pose_blocks, project_backward, project_forward
 from extrap_train.views import Camera
+
+
+def array(tensor: Float[Tensor, "*b"]) -> Float[np.ndarray, "*b"]:
+    """The tensor's own memory where it is contiguous, else a contiguous copy."""
+    return tensor.detach().contiguous().numpy()
+
 
 NEAR_PLANE = 0.01
 LOW_PASS = 0.3

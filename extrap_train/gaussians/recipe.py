@@ -8,21 +8,25 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from extrap_train.gaussians.density import GrowthStatistics, grow, prune, reset_opacity
-from extrap_train.gaussians.drawing import Drawing, draw
-from extrap_train.gaussians.gaussians import rgb_to_sh
+from extrap_train.gaussians.init import (
+    Points,
+    joined,
+    pixel_points,
+    random_points,
+    triangulated_points,
+)
+from extrap_train.gaussians.losses import photograph, photometric_loss
+from extrap_train.gaussians.model import GaussianParameters, rgb_to_sh
 from extrap_train.gaussians.optimiser import GaussianOptimiser
-from extrap_train.gaussians.options import BACKGROUNDS, GaussianOptions
-from extrap_train.gaussians.parameters import GaussianParameters
-from extrap_train.gaussians.photometric import photograph, photometric_loss
-from extrap_train.gaussians.points import Points, joined, pixel_points, random_points
-from extrap_train.gaussians.rasterization import rasterizer
-from extrap_train.gaussians.scene import TrainingScene
-from extrap_train.gaussians.schedule import (
+from extrap_train.gaussians.options import (
+    BACKGROUNDS,
     LEAST_BETWEEN_GROWTH,
     LEAST_BETWEEN_RESETS,
+    GaussianOptions,
     Schedule,
 )
-from extrap_train.gaussians.triangulate import triangulated_points
+from extrap_train.gaussians.rasterize import Drawing, draw, rasterizer
+from extrap_train.gaussians.scene import TrainingScene
 from extrap_train.views import Camera
 
 

@@ -17,7 +17,7 @@ from extrap_train.config import TrainConfig
 from extrap_train.data.sequences import Frame, Sequence
 from extrap_train.data.synthetic import SyntheticScene
 from extrap_train.errors import InputError
-from extrap_train.gaussians.trainer import Diverged
+from extrap_train.gaussians.fit import Diverged
 from extrap_train.metrics import psnr, quantised, squeeze_lpips, ssim
 from extrap_train.pictures import colour_depth, contact_sheet, error_map, mark_holes
 from extrap_train.reconstruction.cloud import PointCloud, cloud_of

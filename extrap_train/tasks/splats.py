@@ -13,12 +13,11 @@ from torch import Tensor
 from extrap_train.config import SplatsConfig
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError
-from extrap_train.gaussians.drawing import draw
-from extrap_train.gaussians.fit_views import fit_views
-from extrap_train.gaussians.gaussians import Gaussians
+from extrap_train.gaussians.fit import fit_views
+from extrap_train.gaussians.model import Gaussians
 from extrap_train.gaussians.options import BACKGROUNDS, GaussianOptions
 from extrap_train.gaussians.ply import read_comments, read_splats, write_splats
-from extrap_train.gaussians.rasterization import rasterizer
+from extrap_train.gaussians.rasterize import draw, rasterizer
 from extrap_train.metrics import psnr, quantised
 from extrap_train.pictures import contact_sheet, error_map
 from extrap_train.reconstruction.global_map import GlobalMap

@@ -8,7 +8,7 @@ from benchmarks.perf.gaussians_reference import rasterize_reference
 from benchmarks.perf.timing import compare
 from benchmarks.perf.warp import orbit_camera
 from extrap_train.errors import InputError
-from extrap_train.gaussians.rasterization import rasterizer
+from extrap_train.gaussians.rasterize import rasterizer
 
 SIZE = 40
 

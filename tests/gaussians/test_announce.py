@@ -2,14 +2,14 @@
 
 import numba
 
-from extrap_train.gaussians import announce
+from extrap_train.gaussians import rasterize
 
 
 def test_says_once_that_it_compiles(caplog, monkeypatch):
-    monkeypatch.setattr(announce, "_ANNOUNCER", announce._Announcer())
+    monkeypatch.setattr(rasterize, "_ANNOUNCER", rasterize._Announcer())
     kernel = numba.njit(lambda x: x + 1)
     for argument in (1, 1, 1.0):
-        with announce.announced_compilation():
+        with rasterize.announced_compilation():
             kernel(argument)
     assert caplog.text.count("compiling the CPU rasteriser") == 1
 
@@ -17,7 +17,7 @@ def test_says_once_that_it_compiles(caplog, monkeypatch):
 def test_is_silent_when_nothing_is_compiled(caplog, monkeypatch):
     kernel = numba.njit(lambda x: x * 2)
     kernel(1)
-    monkeypatch.setattr(announce, "_ANNOUNCER", announce._Announcer())
-    with announce.announced_compilation():
+    monkeypatch.setattr(rasterize, "_ANNOUNCER", rasterize._Announcer())
+    with rasterize.announced_compilation():
         kernel(1)
     assert not caplog.text

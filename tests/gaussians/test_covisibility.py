@@ -2,8 +2,8 @@
 
 import torch
 
+from benchmarks.methods.instantsplat import nearest_depth, unique_pixels
 from extrap_train.depth import DepthMap
-from extrap_train.gaussians.covisibility import nearest_depth, unique_pixels
 from extrap_train.views import View
 from tests.scenes import CARD_AND_PLANE, SPHERE_ON_PLANE, Scene, orbit_camera
 

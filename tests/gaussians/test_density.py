@@ -6,6 +6,7 @@ import pytest
 import roma
 import torch
 
+from benchmarks.methods.fsgs import edges, unpooled
 from extrap_train.gaussians.density import (
     GrowthStatistics,
     grow,
@@ -14,10 +15,9 @@ from extrap_train.gaussians.density import (
     rotation_matrices,
     split_in_two,
 )
+from extrap_train.gaussians.model import GaussianParameters
 from extrap_train.gaussians.optimiser import GaussianOptimiser
 from extrap_train.gaussians.options import GaussianOptions
-from extrap_train.gaussians.parameters import GaussianParameters
-from extrap_train.gaussians.unpool import edges, unpooled
 
 RATES = dict.fromkeys(("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest"), 1e-2)
 

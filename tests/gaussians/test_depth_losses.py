@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from extrap_train.gaussians.depth_losses import (
+from extrap_train.gaussians.losses import (
     edge_aware_smoothness,
     filled,
     normalised_patches,

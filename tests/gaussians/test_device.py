@@ -16,17 +16,16 @@ from benchmarks.methods.base import SceneInputs
 from benchmarks.methods.dngaussian import DnGaussian
 from benchmarks.methods.fsgs import Fsgs
 from benchmarks.methods.gaussian_method import GaussianMethod
-from benchmarks.methods.instantsplat import InstantSplat
+from benchmarks.methods.instantsplat import InstantSplat, aligned_to_photograph
 from benchmarks.methods.threedgs import ThreeDgs
 from extrap_train.depth import DepthMap
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.gaussians import recipe
-from extrap_train.gaussians.gaussians import Gaussians
+from extrap_train.gaussians.fit import Fit
+from extrap_train.gaussians.model import Gaussians
 from extrap_train.gaussians.options import RASTERIZERS
-from extrap_train.gaussians.poses import aligned_to_photograph
-from extrap_train.gaussians.rasterization import rasterization
+from extrap_train.gaussians.rasterize import rasterization
 from extrap_train.gaussians.recipe import Recipe
-from extrap_train.gaussians.trainer import Fit
 from extrap_train.metrics import psnr
 from extrap_train.views import View
 from tests.benchmarks.analytic import scene_inputs

@@ -16,13 +16,11 @@ from benchmarks.methods.threedgs import ThreeDgs
 from extrap_train.depth import DepthMap
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError
-from extrap_train.gaussians.fit_views import fit_views
-from extrap_train.gaussians.options import GaussianOptions
+from extrap_train.gaussians.fit import Diverged, fit, fit_views
+from extrap_train.gaussians.options import GaussianOptions, exponential
 from extrap_train.gaussians.ply import read_splats, write_splats
 from extrap_train.gaussians.recipe import Recipe
 from extrap_train.gaussians.scene import training_scene
-from extrap_train.gaussians.schedule import exponential
-from extrap_train.gaussians.trainer import Diverged, fit
 from extrap_train.geometry.cameras import unproject_to_world
 from extrap_train.metrics import psnr
 from tests.benchmarks.analytic import scene_inputs

@@ -8,13 +8,16 @@ import torch
 
 from benchmarks.methods.dngaussian import DnGaussian
 from extrap_train.gaussians.density import GrowthStatistics
-from extrap_train.gaussians.nearest import nearest_expected
+from extrap_train.gaussians.init import (
+    Points,
+    nearest_expected,
+    parameters_from_points,
+    random_points,
+)
 from extrap_train.gaussians.optimiser import GaussianOptimiser
-from extrap_train.gaussians.parameters import parameters_from_points
-from extrap_train.gaussians.points import Points, random_points
+from extrap_train.gaussians.options import Schedule
 from extrap_train.gaussians.recipe import Training
 from extrap_train.gaussians.scene import training_scene
-from extrap_train.gaussians.schedule import Schedule
 from extrap_train.geometry.cameras import project
 from extrap_train.views import Camera
 from tests.benchmarks.analytic import scene_inputs

@@ -2,7 +2,7 @@
 
 import torch
 
-from extrap_train.gaussians.neural_colour import HashGrid, NeuralColor, hashed
+from benchmarks.methods.dngaussian import HashGrid, NeuralColor, hashed
 
 
 def test_the_grid_is_its_table_at_corners_and_linear_between():

@@ -5,12 +5,7 @@ import torch
 from skimage.metrics import structural_similarity
 from torch.nn import functional
 
-from extrap_train.gaussians.photometric import (
-    blurred,
-    photograph,
-    photometric_loss,
-    ssim_map,
-)
+from extrap_train.gaussians.losses import blurred, photograph, photometric_loss, ssim_map
 
 
 def _pair(height: int = 40, width: int = 32) -> tuple[torch.Tensor, torch.Tensor]:

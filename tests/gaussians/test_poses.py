@@ -4,12 +4,12 @@ import math
 
 import torch
 
-from extrap_train.gaussians.poses import (
+from benchmarks.methods.fsgs import pseudo_camera
+from benchmarks.methods.instantsplat import (
     PoseCorrections,
     aligned_to_photograph,
     similarity_between,
 )
-from extrap_train.gaussians.pseudo_views import pseudo_camera
 from extrap_train.geometry.cameras import project
 from extrap_train.views import Camera
 from tests.scenes import orbit_camera

@@ -12,11 +12,11 @@ from extrap_train.depth import DepthMap
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError
 from extrap_train.gaussians.density import GrowthStatistics
+from extrap_train.gaussians.init import parameters_from_points
 from extrap_train.gaussians.optimiser import GaussianOptimiser
-from extrap_train.gaussians.parameters import parameters_from_points
+from extrap_train.gaussians.options import Schedule
 from extrap_train.gaussians.recipe import Training
 from extrap_train.gaussians.scene import training_scene
-from extrap_train.gaussians.schedule import Schedule
 from extrap_train.views import View
 from tests.benchmarks.analytic import scene_inputs
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 from splats import camera_pose, pinhole, random_gaussians
 
-from extrap_train.gaussians.rasterization import rasterization
-from extrap_train.gaussians.spherical_harmonics import sh_colors
+from extrap_train.gaussians.model import sh_colors
+from extrap_train.gaussians.rasterize import rasterization
 
 WIDTH, HEIGHT = 45, 38
 

@@ -4,11 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from extrap_train.gaussians.triangulate import (
-    projection_matrices,
-    triangulate,
-    triangulated_points,
-)
+from extrap_train.gaussians.init import projection_matrices, triangulate, triangulated_points
 from extrap_train.geometry.cameras import project
 from extrap_train.views import View
 from tests.scenes import orbit_camera as analytic_camera

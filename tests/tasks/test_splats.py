@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from extrap_train.config import SplatsConfig
+from extrap_train.gaussians.fit import Diverged
 from extrap_train.gaussians.ply import read_splats
-from extrap_train.gaussians.trainer import Diverged
 from extrap_train.reconstruction.global_map import GlobalMap, Origin
 from extrap_train.reconstruction.inputs import WorldUnit
 from extrap_train.tasks import splats as task

@@ -1,20 +1,53 @@
 """Drawing Gaussians, with gsplat's `rasterization` signature and results."""
 
-from collections.abc import Callable
-from dataclasses import replace
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from numba.core.event import Event, Listener, install_listener
 from torch import Tensor
 
 from extrap_train.errors import InputError
-from extrap_train.gaussians.announce import announced_compilation
 from extrap_train.gaussians.blend import blend_ellipses
+from extrap_train.gaussians.model import Gaussians, sh_colors
 from extrap_train.gaussians.projection import LOW_PASS, NEAR_PLANE, Ellipses, project
-from extrap_train.gaussians.spherical_harmonics import sh_colors
 from extrap_train.views import Camera
+
+_LOG = logging.getLogger(__name__)
+
+
+class _Announcer(Listener):
+    """Logs one line when numba compiles for the first time; loading from its cache is no event."""
+
+    def __init__(self) -> None:
+        self.silent = False
+
+    def on_start(self, event: Event) -> None:
+        if not self.silent:
+            _LOG.warning(
+                "compiling the CPU rasteriser (about half a minute, once on this machine; "
+                "later runs load it from numba's cache)"
+            )
+        self.silent = True
+
+    def on_end(self, event: Event) -> None:
+        """Nothing to say."""
+
+
+_ANNOUNCER = _Announcer()
+
+
+@contextmanager
+def announced_compilation() -> Iterator[None]:
+    """Log a warning, once a process, if numba compiles anything inside."""
+    with install_listener("numba:compile", _ANNOUNCER):
+        yield
+
 
 Backend = Literal["numba", "gsplat"]
 """What draws: ours on the CPU, or gsplat on CUDA."""
@@ -128,3 +161,48 @@ def _draw(
         expected = image[..., -1:] / alpha[..., None].clamp(min=_LEAST_DIVISOR)
         image = torch.cat([image[..., :-1], expected], -1)
     return image, alpha
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """What one camera sees."""
+
+    image: Float[Tensor, "3 h w"]
+    depth: Float[Tensor, "h w"]
+    """Expected depth; 0 where nothing is."""
+    alpha: Float[Tensor, "h w"]
+    centers: Float[Tensor, "1 n 2"]
+    """Projected means in pixels: holds the screen-space gradient after a backward pass."""
+    radii: Int[Tensor, "1 n 2"]
+    """In pixels; 0 where a Gaussian is not drawn."""
+
+
+def draw(
+    rasterize: Rasterization,
+    gaussians: Gaussians,
+    camera: Camera,
+    background: float,
+    sh_degree: int,
+    colors: Float[Tensor, "n 3"] | None = None,
+) -> Drawing:
+    """Colours by spherical harmonics up to `sh_degree`, or as given."""
+    behind = gaussians.means.new_full((1, 3), background)
+    values, alphas, found = rasterize(
+        means=gaussians.means,
+        quats=gaussians.quats,
+        scales=gaussians.scales,
+        opacities=gaussians.opacities,
+        colors=gaussians.sh if colors is None else colors,
+        viewmats=camera.world_to_cam[None],
+        Ks=camera.intrinsics[None],
+        width=camera.width,
+        height=camera.height,
+        sh_degree=sh_degree if colors is None else None,
+        backgrounds=behind,
+        render_mode="RGB+ED",
+    )
+    centers = found["means2d"]
+    if centers.requires_grad:
+        centers.retain_grad()
+    image = values[0, ..., :3].permute(2, 0, 1)
+    return Drawing(image, values[0, ..., 3], alphas[0, ..., 0], centers, found["radii"])

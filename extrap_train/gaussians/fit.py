@@ -5,25 +5,21 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 from tqdm import tqdm
 
+from extrap_train.depth import DepthSource
 from extrap_train.errors import InputError
 from extrap_train.gaussians.density import GrowthStatistics
-from extrap_train.gaussians.drawing import Drawing
-from extrap_train.gaussians.gaussians import Gaussians
-from extrap_train.gaussians.optimiser import GaussianOptimiser
-from extrap_train.gaussians.options import GaussianOptions
-from extrap_train.gaussians.parameters import (
-    GaussianParameters,
-    from_tensors,
-    parameters_from_points,
-)
-from extrap_train.gaussians.points import Points
+from extrap_train.gaussians.init import Points, parameters_from_points
+from extrap_train.gaussians.model import GaussianParameters, Gaussians, from_tensors
+from extrap_train.gaussians.optimiser import GaussianOptimiser, ModuleOptimiser, is_finite
+from extrap_train.gaussians.options import GaussianOptions, Schedule, exponential
+from extrap_train.gaussians.rasterize import Drawing
 from extrap_train.gaussians.recipe import Recipe, Training
-from extrap_train.gaussians.schedule import Schedule, exponential
+from extrap_train.gaussians.scene import training_scene
 from extrap_train.geometry.cameras import unproject_to_world
-from extrap_train.views import Camera
+from extrap_train.views import Camera, View
 
 WIDEST_START = 0.05
 """Of the distance to the nearest input camera: among a few hundred scattered points neighbours are
@@ -115,7 +111,7 @@ def fit(recipe: Recipe, points: Points | None = None, show_progress: bool = Fals
         f"{options.iterations} of {options.full_iterations} iterations, "
         f"learning rates x {schedule.rate_factor:.3g}"
     )
-    modules = _ModuleOptimiser(recipe.modules(), schedule)
+    modules = ModuleOptimiser(recipe.modules(), schedule)
     order: list[int] = []
     for step in tqdm(range(1, options.iterations + 1), disable=not show_progress, unit="it"):
         training.iteration = step
@@ -143,7 +139,7 @@ def learning_rates(
     }
 
 
-def _iterate(recipe: Recipe, training: Training, modules: "_ModuleOptimiser", index: int) -> None:
+def _iterate(recipe: Recipe, training: Training, modules: ModuleOptimiser, index: int) -> None:
     progress = training.iteration / recipe.options.iterations
     rates = learning_rates(recipe.options, training.schedule, progress)
     training.optimiser.set_rate("means", rates["means"])
@@ -163,20 +159,13 @@ def _iterate(recipe: Recipe, training: Training, modules: "_ModuleOptimiser", in
     recipe.adapt(training)
 
 
-def _check(training: Training, modules: "_ModuleOptimiser") -> None:
+def _check(training: Training, modules: ModuleOptimiser) -> None:
     """What a loss of finite numbers can hide: a Gaussian that is NaN is not drawn."""
     for name, values in _tensors(training).items():
         if not is_finite(values):
             raise _diverged(f"{name} stopped being finite", training)
     if not modules.is_finite():
         raise _diverged("what is learnt beside the Gaussians stopped being finite", training)
-
-
-def is_finite(values: Float[Tensor, "..."]) -> bool:
-    """Whether no number is NaN or infinite, or so large that their sum is: one pass, where asking
-    every number took half the time of an iteration with a hash grid.
-    """
-    return bool(values.sum().isfinite())
 
 
 def _diverged(what: str, training: Training) -> Diverged:
@@ -198,28 +187,12 @@ def _tensors(training: Training) -> dict[str, Tensor]:
     return training.optimiser.parameters.tensors()
 
 
-class _ModuleOptimiser:
-    """Adam for what is learnt beside the Gaussians, at rates that fall exponentially."""
+def fit_views(
+    views: Sequence[View], depth_source: DepthSource, options: GaussianOptions, seed: int
+) -> Fit:
+    """Plain 3DGS of posed views, with a progress bar; `Fit.gaussians()` is what a PLY holds.
 
-    def __init__(
-        self, modules: Sequence[tuple[nn.Module, float, float]], schedule: Schedule
-    ) -> None:
-        self._rates = [
-            (start * schedule.rate_factor, end * schedule.rate_factor) for _, start, end in modules
-        ]
-        self._learnt = [value for module, _, _ in modules for value in module.parameters()]
-        groups = [{"params": list(module.parameters())} for module, _, _ in modules]
-        self._adam = torch.optim.Adam(groups, eps=1e-15, fused=True) if groups else None
-
-    def is_finite(self) -> bool:
-        """Whether no number that is learnt is NaN or infinite."""
-        return all(is_finite(value.detach()) for value in self._learnt)
-
-    def step(self, progress: float) -> None:
-        """One step along the gradients, which are then forgotten."""
-        if self._adam is None:
-            return
-        for group, (start, end) in zip(self._adam.param_groups, self._rates, strict=True):
-            group["lr"] = exponential(start, end, progress)
-        self._adam.step()
-        self._adam.zero_grad(set_to_none=True)
+    `options.init="dense"` starts from the depth source's points, which is best where views carry
+    depth. InputError for views or points that cannot be used, `Diverged` where training fails.
+    """
+    return fit(Recipe(options, training_scene(views, depth_source, seed)), show_progress=True)
