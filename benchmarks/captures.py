@@ -1,7 +1,6 @@
 """The test captures of a table, whatever they come from."""
 
-from collections.abc import Callable
-from collections.abc import Sequence as List
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,11 +17,11 @@ from extrap_train.config import CapturesConfig, PrepConfig, RulesConfig, Synthet
 from extrap_train.data.co3d import read_category
 from extrap_train.data.json_files import read_json
 from extrap_train.data.photographs import CATEGORY as NO_CATEGORY
-from extrap_train.data.posed import TRANSFORMS, read_transforms
 from extrap_train.data.scene import open_scene
-from extrap_train.data.sequences import Sequence
+from extrap_train.data.sequences import FrameSequence
 from extrap_train.data.synthetic import build_scene, surface_points
 from extrap_train.data.synthetic.capture import synthetic_sequence
+from extrap_train.data.transforms_json import TRANSFORMS, read_transforms
 from extrap_train.data.validation import require_list
 from extrap_train.errors import InputError
 from extrap_train.views import stack_poses
@@ -35,12 +34,12 @@ CLOUD_POINTS = 20_000
 class Capture:
     """A test capture, and its true surface where that is known."""
 
-    sequence: Sequence
+    sequence: FrameSequence
     surface: Callable[[], TrueSurface] | None = None
 
 
 def open_captures(
-    config: CapturesConfig, categories: list[str], models: List[TrainedModel] = ()
+    config: CapturesConfig, categories: list[str], models: Sequence[TrainedModel] = ()
 ) -> list[Capture]:
     """The test captures of some categories; nothing is rendered or decoded yet.
 
@@ -54,7 +53,7 @@ def open_captures(
 
 
 def _open(
-    config: CapturesConfig, categories: list[str], models: List[TrainedModel]
+    config: CapturesConfig, categories: list[str], models: Sequence[TrainedModel]
 ) -> list[Capture]:
     match config.source:
         case "synthetic":
@@ -105,14 +104,16 @@ def _synthetic(config: CapturesConfig, category: str, index: int) -> Capture:
     return Capture(synthetic_sequence(category, index, options), surface)
 
 
-def _with_cloud(sequence: Sequence) -> Capture:
+def _with_cloud(sequence: FrameSequence) -> Capture:
     cloud = sequence.point_cloud.find() if sequence.point_cloud else None
     if cloud is None:
         return Capture(sequence)
     return Capture(sequence, lambda: TrueSurface(read_points(cloud), torch.zeros(0, 3)))
 
 
-def _co3d(config: CapturesConfig, category: str, models: List[TrainedModel]) -> list[Sequence]:
+def _co3d(
+    config: CapturesConfig, category: str, models: Sequence[TrainedModel]
+) -> list[FrameSequence]:
     """The captures that the models' runs have held out; where no run says so, those that training
     on the same download with its usual options does.
     """
@@ -132,7 +133,7 @@ def _co3d(config: CapturesConfig, category: str, models: List[TrainedModel]) -> 
     return [sequences[name] for name in (*split.test, *split.lone)]
 
 
-def _reconfusion(config: CapturesConfig) -> list[Sequence]:
+def _reconfusion(config: CapturesConfig) -> list[FrameSequence]:
     """A folder a scene, as the split's authors hand it out; frames are counted in name order."""
     if config.root is None:
         raise InputError("captures.source=reconfusion needs its folder: give captures.root=FOLDER")
@@ -142,7 +143,7 @@ def _reconfusion(config: CapturesConfig) -> list[Sequence]:
     return [replace(read_transforms(f), category="co3d", name=f.name) for f in folders]
 
 
-def _given_draws(config: CapturesConfig, capture: Sequence, rules: RulesConfig) -> list[Draw]:
+def _given_draws(config: CapturesConfig, capture: FrameSequence, rules: RulesConfig) -> list[Draw]:
     """The split files' own choice, `{"train_ids": [...], "test_ids": [...]}`."""
     draws = []
     for n_views in rules.views:
@@ -165,7 +166,7 @@ def _given_draws(config: CapturesConfig, capture: Sequence, rules: RulesConfig) 
     return draws
 
 
-def _frames_of(capture: Sequence, ids: list[Any]) -> tuple[str, ...]:
+def _frames_of(capture: FrameSequence, ids: list[Any]) -> tuple[str, ...]:
     """The names of frames by their places among all that are listed, in the order of names.
 
     ValueError where those cannot be meant, or where the frame has no picture.
@@ -183,7 +184,7 @@ def _frames_of(capture: Sequence, ids: list[Any]) -> tuple[str, ...]:
     return names
 
 
-def _named(spec: str, categories: list[str]) -> Sequence:
+def _named(spec: str, categories: list[str]) -> FrameSequence:
     """A capture that does not know its category takes the table's, if that is only one."""
     capture = open_scene(spec)
     if capture.category == NO_CATEGORY and len(categories) == 1:

@@ -19,7 +19,7 @@ from extrap_train.data.images import to_eight_bits
 from extrap_train.data.module import compute_warp
 from extrap_train.data.queries import query_batch
 from extrap_train.depth import NoDepthError
-from extrap_train.depth.build import depth_source
+from extrap_train.depth.sources import depth_source
 from extrap_train.errors import InputError
 from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
 from extrap_train.store.atomic import atomic_folder

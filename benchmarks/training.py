@@ -6,7 +6,7 @@ from pathlib import Path
 
 from data_prep.split import by_hash
 from extrap_train.config import MethodConfig
-from extrap_train.data.sequences import Sequence
+from extrap_train.data.sequences import FrameSequence
 from extrap_train.errors import InputError
 from extrap_train.store.cache import read_manifest
 from extrap_train.store.manifest import MANIFEST, Split
@@ -21,7 +21,7 @@ class TrainedModel:
     category: str
     data: Split
 
-    def require_unseen(self, captures: Iterable[Sequence]) -> None:
+    def require_unseen(self, captures: Iterable[FrameSequence]) -> None:
         """InputError for the first capture that the model was trained on.
 
         By name alone: those of CO3D are unique, whatever a table calls their category.

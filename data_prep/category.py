@@ -33,7 +33,7 @@ from extrap_train.config import (
 from extrap_train.data.co3d import read_category, require_category
 from extrap_train.data.co3d.set_lists import read_sequence_split
 from extrap_train.data.prepared import PreparedData
-from extrap_train.data.sequences import Sequence
+from extrap_train.data.sequences import FrameSequence
 from extrap_train.jobs import Launcher
 from extrap_train.jobs.build import open_launcher
 
@@ -137,7 +137,7 @@ def _alone(lock: Path) -> Iterator[None]:
 
 def _sequences(
     category: str, data: DataConfig, output: Path, launcher: Launcher
-) -> tuple[list[Sequence], set[str] | int]:
+) -> tuple[list[FrameSequence], set[str] | int]:
     if isinstance(data, SyntheticConfig):
         root = Path(data.root) if data.root else output / "synthetic"
         synthesize(data, category, root, launcher)

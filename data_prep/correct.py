@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from extrap_train.geometry.epipolar import steps_across
-from extrap_train.geometry.flow import fit_flow, flow_at, least_squares_flow
+from extrap_train.geometry.spline_flow import fit_flow, flow_at, least_squares_flow
 from extrap_train.geometry.warp import warp_references
 from extrap_train.matching import Matcher
 from extrap_train.views import Camera, Warp, stack_cameras
@@ -38,7 +38,8 @@ LEAST_GAIN = 0.01
 """Share of the photometric error that a correction must take away: less is within what resampling
 does to a warp. Says nothing of chance, which takes away as much."""
 STIFFER = (1e-4, 1e-3)
-"""Also tried in place of `flow.STIFFNESS`: noise in the depths shakes a field that bends easily."""
+"""Also tried in place of `spline_flow.STIFFNESS`: noise in the depths shakes a field that bends
+easily."""
 MOST_MATCHES = 2000
 """A smooth field needs no more."""
 
@@ -48,7 +49,7 @@ class Correction:
     """What came of one pair."""
 
     flow: Float[Tensor, "2 g g"] | None
-    """Control vectors (`geometry.flow`); None where the warp stays as it is."""
+    """Control vectors (`geometry.spline_flow`); None where the warp stays as it is."""
     error_before: float
     """Photometric error of the warp against the truth, over what the warp shows; NaN of none."""
     error_after: float
@@ -93,14 +94,14 @@ def correct_pair(
     if float((steps * size / 2).norm(dim=1).median()) < LEAST_STEP:
         return Correction(None, error_before, error_before, "the matches hardly move")
     flows = [flow, *(least_squares_flow(positions, steps, weights, grid, s) for s in STIFFER)]
-    tried = [_tried(before, image, depth, reference, truth, query, flow) for flow in flows]
+    tried = [_try_flow(before, image, depth, reference, truth, query, flow) for flow in flows]
     best = max(tried, key=_gain)
     if not _gain(best) >= LEAST_GAIN:
         return Correction(None, error_before, error_before, "the picture comes no closer")
     return best
 
 
-def _tried(
+def _try_flow(
     before: Warp,
     image: Float[Tensor, "3 h w"],
     depth: Float[Tensor, "h w"],
@@ -158,11 +159,11 @@ def photometric_error(
     if not seen.any():
         return float("nan")
     weight = seen.float()[None, None]
-    difference = (_smoothed((warp.image - truth) * weight) / _smoothed(weight).clamp_min(1e-6))[0]
+    difference = (_smooth((warp.image - truth) * weight) / _smooth(weight).clamp_min(1e-6))[0]
     return float(difference.abs().mean(0)[seen].mean())
 
 
-def _smoothed(image: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+def _smooth(image: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
     return functional.avg_pool2d(image, 3, 1, 1, count_include_pad=False)
 
 

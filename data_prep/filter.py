@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Sequence as ListOf
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,17 +10,16 @@ from jaxtyping import Float
 
 from extrap_train.config import PrepConfig
 from extrap_train.data.camera_check import CO3D_POSES, find_pose_fault
-from extrap_train.data.sequences import Sequence
+from extrap_train.data.sequences import FrameSequence
 from extrap_train.data.square_frames import too_many_unusable
 from extrap_train.data.validation import is_degenerate
-from extrap_train.geometry.viewpoints import facing, fit_orbit, scene_center
+from extrap_train.geometry.viewpoints import LOOKS_AT_RAD, facing, fit_orbit, scene_center
 from extrap_train.views import Camera, stack_poses
 
 LOG = logging.getLogger(__name__)
 
 MIN_FRAMES = 8
 """Fewer do not make a capture; two do, where a full circle is not asked for."""
-_FACING_RAD = math.radians(60)
 _MIN_FACING_SHARE = 0.9
 _MAX_ELEVATION_RAD = math.radians(75)
 """Nearer to the orbit's pole an azimuth means nothing."""
@@ -40,7 +39,7 @@ class Verdict:
     """360° less the arc's opening, which is the largest gap of all."""
 
 
-def judge_all(sequences: ListOf[Sequence], options: PrepConfig) -> list[Verdict]:
+def judge_all(sequences: Sequence[FrameSequence], options: PrepConfig) -> list[Verdict]:
     """Keep or drop each sequence of a category.
 
     Where a full circle is preferred and none is there, every sequence that is sound otherwise is
@@ -56,7 +55,7 @@ def judge_all(sequences: ListOf[Sequence], options: PrepConfig) -> list[Verdict]
     return relaxed
 
 
-def judge(sequence: Sequence, options: PrepConfig) -> Verdict:
+def judge(sequence: FrameSequence, options: PrepConfig) -> Verdict:
     """Keep or drop a sequence; a quality that the capture does not state is no reason."""
     count = len(sequence.frames)
     if too_many := too_many_unusable(sequence.left_out, sequence):
@@ -74,7 +73,7 @@ def judge(sequence: Sequence, options: PrepConfig) -> Verdict:
         )
     if fault := find_pose_fault(cameras, CO3D_POSES):
         return Verdict(False, fault, count)
-    facing_share = float(facing(cameras, scene_center(cameras), _FACING_RAD).mean())
+    facing_share = float(facing(cameras, scene_center(cameras), LOOKS_AT_RAD).mean())
     gap, coverage = azimuth_coverage(cameras)
     reasons = _quality_reasons(sequence, options)
     if circle:
@@ -97,7 +96,7 @@ def _sorted_gaps_deg(azimuths_rad: Float[np.ndarray, " n"]) -> Float[np.ndarray,
     return np.sort(np.diff(azimuths, append=azimuths[:1] + 360))
 
 
-def _quality_reasons(sequence: Sequence, options: PrepConfig) -> list[str]:
+def _quality_reasons(sequence: FrameSequence, options: PrepConfig) -> list[str]:
     scores = (
         ("viewpoint", sequence.viewpoint_quality, options.min_viewpoint_quality),
         ("point cloud", sequence.point_cloud_quality, options.min_point_cloud_quality),

@@ -23,10 +23,10 @@ from extrap_train.config import (
 )
 from extrap_train.data.paths import file_stamp
 from extrap_train.depth import DepthSource
-from extrap_train.depth.build import depth_source, weight_files
+from extrap_train.depth.sources import depth_source, weight_files
 from extrap_train.device import fastest_device
 from extrap_train.matching import Matcher
-from extrap_train.matching.build import matcher
+from extrap_train.matching.matchers import matcher
 
 Model = TypeVar("Model")
 

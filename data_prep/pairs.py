@@ -22,7 +22,7 @@ from extrap_train.data.frame_files import (
     read_sealed,
     write_sealed,
 )
-from extrap_train.data.square_frames import held_out
+from extrap_train.data.square_frames import held_out_mask
 from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
 from extrap_train.matching import Matcher
 from extrap_train.store.atomic import atomic_folder
@@ -85,7 +85,7 @@ class PairFiles:
 def reference_frames(depth_share: Float[np.ndarray, " n"], lone: bool) -> Bool[np.ndarray, " n"]:
     """Which frames may be references."""
     known = depth_share >= MIN_DEPTH_SHARE
-    return known & ~held_out(len(known)) if lone else known
+    return known & ~held_out_mask(len(known)) if lone else known
 
 
 def choose_pairs(frames: StoredFrames, name: str, role: str, options: PrepConfig) -> pd.DataFrame:
@@ -94,7 +94,7 @@ def choose_pairs(frames: StoredFrames, name: str, role: str, options: PrepConfig
     angles = pairwise_angles(frames.camera, scene_center(frames.camera))
     queries = {role: np.ones(count, bool)}
     if lone:
-        queries = {"train": ~held_out(count), "test": held_out(count)}
+        queries = {"train": ~held_out_mask(count), "test": held_out_mask(count)}
     references = reference_frames(frames.depth_share, lone)
     parts = []
     for split, allowed in queries.items():

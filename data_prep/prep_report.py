@@ -16,7 +16,7 @@ from rich.table import Table
 from data_prep.drop_summary import group_reasons
 from extrap_train.data.examples import collate, linspace_indices, read_example
 from extrap_train.data.prepared import UNTOUCHED, Pairs, PreparedData
-from extrap_train.data.square_frames import held_out
+from extrap_train.data.square_frames import held_out_mask
 from extrap_train.geometry.viewpoints import fit_orbit
 from extrap_train.geometry.warp import warp_references
 from extrap_train.pictures import colour_depth, contact_sheet, error_map, mark_holes
@@ -125,7 +125,7 @@ def coverage(data: PreparedData) -> Figure:
     axes = figure.add_subplot(projection="polar")
     for ring, (name, role) in enumerate(zip(shown["sequence"], shown["split"], strict=True)):
         azimuths = fit_orbit(data.cameras(name)).azimuths_rad
-        tested = held_out(len(azimuths)) if role == "train and test" else role == "test"
+        tested = held_out_mask(len(azimuths)) if role == "train and test" else role == "test"
         tested = np.broadcast_to(tested, azimuths.shape)
         for split, own in (("train", ~tested), ("test", tested)):
             rings, colour = np.full(own.sum(), ring + 8), _COLOURS[split]

@@ -4,8 +4,7 @@ import hashlib
 import json
 import logging
 import shutil
-from collections.abc import Collection, Iterator, Mapping
-from collections.abc import Sequence as ListOf
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from data_prep.split import Split, split_sequences
 from data_prep.tables import Outcome, write_results
 from extrap_train.config import DepthConfig, MatcherConfig, PrepConfig
 from extrap_train.data.prepared import FORMAT, PreparedData
-from extrap_train.data.sequences import Sequence
+from extrap_train.data.sequences import FrameSequence
 from extrap_train.data.square_frames import METHOD, CaptureKeys, too_many_unusable
 from extrap_train.depth import DepthSource
 from extrap_train.errors import InputError
@@ -40,8 +39,8 @@ _BYTES_PER_PIXEL = 3 + 2 + 1
 class _Plan:
     """What decides everything about a preparation but where it runs."""
 
-    sequences: ListOf[Sequence]
-    capture_keys: ListOf[str]
+    sequences: Sequence[FrameSequence]
+    capture_keys: Sequence[str]
     context: PrepContext
     test_names: Collection[str] | int
     key: str
@@ -50,7 +49,7 @@ class _Plan:
     @classmethod
     def of(
         cls,
-        sequences: ListOf[Sequence],
+        sequences: Sequence[FrameSequence],
         context: PrepContext,
         test_names: Collection[str] | int,
     ) -> "_Plan":
@@ -78,7 +77,7 @@ class _Plan:
 
 
 def prepare(
-    sequences: ListOf[Sequence],
+    sequences: Sequence[FrameSequence],
     depth: DepthConfig | DepthSource,
     options: PrepConfig,
     *,
@@ -232,7 +231,7 @@ def _is_damaged(outcome: Outcome) -> bool:
     return outcome.failed or bool(too_many_unusable(sequence.left_out, sequence))
 
 
-def _disk_full(folder: Path, sequences: ListOf[Sequence], options: PrepConfig) -> str:
+def _disk_full(folder: Path, sequences: Sequence[FrameSequence], options: PrepConfig) -> str:
     frames = sum(len(sequence.frames) for sequence in sequences)
     needed = frames * options.image_size**2 * _BYTES_PER_PIXEL / 2**20
     free = shutil.disk_usage(folder.parent).free / 2**20

@@ -23,7 +23,7 @@ from extrap_train.data.frame_files import (
     read_camera_table,
     write_frames,
 )
-from extrap_train.data.sequences import Sequence
+from extrap_train.data.sequences import FrameSequence
 from extrap_train.data.square_frames import make_frames
 from extrap_train.device import is_out_of_memory
 from extrap_train.errors import InputError
@@ -56,7 +56,7 @@ class SequenceJob:
     """One sequence to prepare, and its role."""
 
     context: PrepContext
-    sequence: Sequence
+    sequence: FrameSequence
     role: str
     """`train`, `test` or `train and test` (`split.Split.role`)."""
     capture_key: str

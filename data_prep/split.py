@@ -54,18 +54,18 @@ def split_sequences(sequences: Sequence[str], test: Collection[str] | int) -> Sp
     tested: list[str] = []
     lone: list[str] = []
     for category, names in members.items():
-        if len(names) == 1 and (isinstance(test, int) or not _chosen(names, test)):
+        if len(names) == 1 and (isinstance(test, int) or not _match_names(names, test)):
             lone += names
         elif isinstance(test, int):
             tested += sorted(names, key=by_hash)[: min(test, len(names) // 2)]
         else:
-            tested += _named(category, names, test)
+            tested += _select_named(category, names, test)
     train = tuple(s for s in sorted(sequences) if s not in {*tested, *lone})
     return Split(train, tuple(sorted(tested)), tuple(lone))
 
 
-def _named(category: str, names: list[str], test: Collection[str]) -> list[str]:
-    chosen = _chosen(names, test)
+def _select_named(category: str, names: list[str], test: Collection[str]) -> list[str]:
+    chosen = _match_names(names, test)
     if len(chosen) == len(names):
         raise InputError(
             f"{category}: all {len(names)} usable sequences are named as test sequences, none is "
@@ -79,7 +79,7 @@ def _named(category: str, names: list[str], test: Collection[str]) -> list[str]:
     return chosen
 
 
-def _chosen(names: Collection[str], test: Collection[str]) -> list[str]:
+def _match_names(names: Collection[str], test: Collection[str]) -> list[str]:
     return [name for name in names if name in test or name.split("/", 1)[1] in test]
 
 

@@ -18,7 +18,7 @@ from data_prep.sequence_job import PrepContext, SequenceJob
 from data_prep.split import Split
 from extrap_train.data.frame_files import read_camera_table
 from extrap_train.data.prepared import FORMAT, TABLES, table_digest
-from extrap_train.data.sequences import Sequence
+from extrap_train.data.sequences import FrameSequence
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import atomic_file, write_atomic
 from extrap_train.store.manifest import package_version
@@ -33,7 +33,7 @@ _ROWS_AT_A_TIME = 50_000
 class Outcome:
     """What became of a sequence."""
 
-    sequence: Sequence
+    sequence: FrameSequence
     verdict: Verdict
     failed: bool
     """Whether it was good enough, but could not be prepared."""
@@ -105,7 +105,7 @@ def _frame_tables(jobs: list[SequenceJob], counts: Counter[str]) -> Iterator[pa.
     for job in jobs:
         cameras = read_camera_table(job.frames_folder, job.frames_key)
         if cameras is None:
-            raise _vanished(job)
+            raise _vanished_error(job)
         counts[job.name] = cameras.num_rows
         references = reference_frames(cameras["depth_share"].to_numpy(), job.is_lone)
         names = pa.array([job.name] * cameras.num_rows, pa.string())
@@ -118,12 +118,12 @@ def _pair_tables(jobs: list[SequenceJob], counts: Counter[tuple[str, str]]) -> I
     for job in jobs:
         pairs = job.pair_files.read()
         if pairs is None:
-            raise _vanished(job)
+            raise _vanished_error(job)
         counts.update((job.name, part) for part in pairs["split"].to_pylist())
         yield pairs.replace_schema_metadata(None)
 
 
-def _vanished(job: SequenceJob) -> InputError:
+def _vanished_error(job: SequenceJob) -> InputError:
     return InputError(f"{job.frames_folder}: vanished or changed meanwhile; run data_prep again")
 
 

@@ -214,8 +214,8 @@ class PairBatch:
     reference_valid: Bool[Tensor, "b k"]
     """False for a place without a reference: every example has at least one, the first."""
     reference_flows: Float[Tensor, "b k 2 g g"] | None = None
-    """Where each reference's warp really belongs (`geometry.flow`); None leaves all where they
-    are."""
+    """Where each reference's warp really belongs (`geometry.spline_flow`); None leaves all where
+    they are."""
     warp: Warp | None = None
     """Made from the references when the batch is made; None before."""
 

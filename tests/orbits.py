@@ -8,7 +8,7 @@ import torch
 from scenes import SPHERE_ON_PLANE, orbit_camera
 from torch.nn import functional
 
-from extrap_train.data.sequences import Frame, Sequence
+from extrap_train.data.sequences import Frame, FrameSequence
 from extrap_train.errors import InputError
 from extrap_train.geometry.cameras import unproject_to_world
 from extrap_train.views import Camera, View, stack_cameras
@@ -68,7 +68,7 @@ def capture(
     mask: Callable[[int], torch.Tensor | None] = lambda index: None,
     broken: Collection[int] = (),
     **quality: float,
-) -> Sequence:
+) -> FrameSequence:
     """A capture whose frame `i` is all of the grey `i / n`, at one depth."""
     count = len(camera.world_to_cam)
 
@@ -91,7 +91,7 @@ def capture(
         )
         for i in range(count)
     )
-    return Sequence("cup", name, frames, **quality)
+    return FrameSequence("cup", name, frames, **quality)
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ def textured_capture(
     size: int = 64,
     depth_factor: float = 1.04,
     broken: Collection[int] = (),
-) -> Sequence:
+) -> FrameSequence:
     """A full circle around a textured sphere, whose depths are all too large by a factor."""
     cameras = [orbit_camera(360 * i / count, size=size) for i in range(count)]
     frames = tuple(
@@ -135,4 +135,4 @@ def textured_capture(
         )
         for i, camera in enumerate(cameras)
     )
-    return Sequence("cup", name, frames)
+    return FrameSequence("cup", name, frames)

@@ -15,7 +15,7 @@ from extrap_train.config import (
     ModelConfig,
     TrainConfig,
 )
-from extrap_train.data.sequences import Sequence
+from extrap_train.data.sequences import FrameSequence
 from extrap_train.runs import run_manifest
 from extrap_train.store.manifest import Manifest
 
@@ -28,12 +28,12 @@ _CONFIG = TrainConfig(
 )
 
 
-def manifest(folder: Path, sequences: list[Sequence], test_names: set[str]) -> Manifest:
+def manifest(folder: Path, sequences: list[FrameSequence], test_names: set[str]) -> Manifest:
     return run_manifest(_CONFIG, [prepared_captures(folder, sequences, test_names)])
 
 
 @pytest.fixture
-def sequences(tmp_path: Path) -> list[Sequence]:
+def sequences(tmp_path: Path) -> list[FrameSequence]:
     """Each of whose frames has a file, of which only the stamp is looked at."""
     made = []
     for index in range(4):
@@ -45,7 +45,7 @@ def sequences(tmp_path: Path) -> list[Sequence]:
 
 
 @pytest.fixture
-def begun(tmp_path: Path, sequences: list[Sequence]) -> Manifest:
+def begun(tmp_path: Path, sequences: list[FrameSequence]) -> Manifest:
     return manifest(tmp_path / "cup", sequences, {"0000"})
 
 
@@ -55,14 +55,14 @@ def test_a_run_records_what_it_is_trained_on(begun: Manifest) -> None:
 
 
 def test_the_same_data_go_on_wherever_they_lie(
-    begun: Manifest, sequences: list[Sequence], tmp_path: Path
+    begun: Manifest, sequences: list[FrameSequence], tmp_path: Path
 ) -> None:
     (tmp_path / "0002.jpg").touch()  # a copy has times of its own
     assert manifest(tmp_path / "moved" / "cup", sequences, {"0000"}).differences(begun) == []
 
 
 def test_changed_photographs_are_a_difference(
-    begun: Manifest, sequences: list[Sequence], tmp_path: Path
+    begun: Manifest, sequences: list[FrameSequence], tmp_path: Path
 ) -> None:
     (tmp_path / "0002.jpg").write_bytes(b"another photograph")
     (found,) = manifest(tmp_path / "cup", sequences, {"0000"}).differences(begun)
@@ -70,7 +70,7 @@ def test_changed_photographs_are_a_difference(
 
 
 def test_another_split_is_a_difference(
-    begun: Manifest, sequences: list[Sequence], tmp_path: Path
+    begun: Manifest, sequences: list[FrameSequence], tmp_path: Path
 ) -> None:
     """Else what is tested on would be what was trained on."""
     found = manifest(tmp_path / "cup", sequences, {"0001"}).differences(begun)

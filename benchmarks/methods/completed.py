@@ -10,7 +10,7 @@ from torch import Tensor
 from benchmarks.methods.base import SceneInputs
 from benchmarks.methods.diffusion import Diffusion, Painted, target_names
 from extrap_train.config import CompletionConfig, StereoConfig
-from extrap_train.depth.build import depth_source
+from extrap_train.depth.sources import depth_source
 from extrap_train.diffusion.generator import GeneratedViews, ViewGenerator
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.reconstruction.cloud import cloud_of

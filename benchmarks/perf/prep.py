@@ -33,7 +33,7 @@ from extrap_train.depth.stereo import PlaneSweepStereo
 from extrap_train.jobs import Launcher
 from extrap_train.jobs.local import LocalLauncher
 from extrap_train.matching import Matches
-from extrap_train.matching.flow import FlowMatcher
+from extrap_train.matching.dense_flow import FlowMatcher
 from extrap_train.views import View
 
 CATEGORY = "hydrant"

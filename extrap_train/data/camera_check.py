@@ -16,11 +16,14 @@ from extrap_train.geometry.opengl import (
     opengl_from_world_to_cam,
     rigid_inverse,
 )
-from extrap_train.geometry.viewpoints import camera_centers, directions_from, scene_center
+from extrap_train.geometry.viewpoints import (
+    LOOKS_AT_RAD,
+    camera_centers,
+    directions_from,
+    scene_center,
+)
 from extrap_train.views import Camera
 
-LOOKS_AT_RAD = np.deg2rad(60)
-"""Between an optical axis and a point that the camera can be said to look at."""
 PARALLEL_RAD = np.deg2rad(15)
 """Cameras whose axes differ by less from their mean look the same way, and need no common point."""
 WIDE_RAD = np.deg2rad(20)

@@ -134,7 +134,7 @@ def _text_cameras(file: Path) -> list[ModelCamera]:
             numbers = tuple(map(float, parameters))
             cameras.append(ModelCamera(int(identity), model, int(height), int(width), numbers))
         except ValueError:
-            raise _malformed(file, number) from None
+            raise _malformed_error(file, number) from None
     return cameras
 
 
@@ -154,13 +154,13 @@ def _text_images(file: Path) -> list[ModelImage]:
         elif not fields:  # allowed before the first image and after the last
             blank_at = number if images else 0
         elif blank_at:
-            raise _malformed(file, blank_at)
+            raise _malformed_error(file, blank_at)
         else:
             try:
                 pose = tuple(map(float, fields[1:8]))
                 images.append(ModelImage(fields[9].strip(), int(fields[8]), pose[:4], pose[4:]))
             except (IndexError, ValueError):
-                raise _malformed(file, number) from None
+                raise _malformed_error(file, number) from None
             is_image = False
     return images
 
@@ -191,5 +191,5 @@ def _lines(file: Path) -> Iterator[tuple[int, str]]:
         raise InputError(f"{file}: cannot be read ({error.strerror}); check the file") from None
 
 
-def _malformed(file: Path, number: int) -> InputError:
+def _malformed_error(file: Path, number: int) -> InputError:
     return InputError(f"{file}: line {number} is malformed; export the model again")

@@ -17,7 +17,7 @@ from extrap_train.data.listed_files import ListedFiles
 from extrap_train.data.paths import check_relative
 from extrap_train.data.photographs import Listed, Photograph, sequence_of_photographs
 from extrap_train.data.picture_files import MAX_PIXELS
-from extrap_train.data.sequences import PointCloud, Sequence
+from extrap_train.data.sequences import FrameSequence, PointCloud
 from extrap_train.errors import InputError
 from extrap_train.geometry.colmap import (
     CAMERA_MODELS,
@@ -64,7 +64,7 @@ def find_model(folder: Path) -> Path | None:
     return largest
 
 
-def read_model(model: Path, images: Path, name: str) -> Sequence:
+def read_model(model: Path, images: Path, name: str) -> FrameSequence:
     """The capture of a COLMAP model; `images` is the folder that its picture names start from.
 
     Distortion is undone when a frame is read. Entries without a picture, and those with a camera

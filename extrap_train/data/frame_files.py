@@ -21,7 +21,7 @@ from extrap_train.store.atomic import atomic_folder, save_array
 from extrap_train.views import Camera
 
 FLOWS = "flows.npy"
-"""Of the pairs of one sequence, beside their table: control vectors (`geometry.flow`)."""
+"""Of the pairs of one sequence, beside their table: control vectors (`geometry.spline_flow`)."""
 IMAGES, DEPTHS, MASKS, CAMERAS = "images.npy", "depth.npy", "mask.npy", "frames.parquet"
 _KEY, _SIZES = b"key", b"sizes"
 _SAFE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}")

@@ -33,11 +33,6 @@ _SIXTEEN_BIT_MODES = ("I;16", "I;16B")
 _DEPTH_MODES = (*_SIXTEEN_BIT_MODES, "I", "F")
 
 
-def read_image(path: Path, size: tuple[int, int]) -> Float[Tensor, "3 h w"]:
-    """The colours of a photograph, as `read_photograph` has them."""
-    return read_photograph(path, size)[0]
-
-
 def read_photograph(
     path: Path, size: tuple[int, int], mask_path: Path | None = None
 ) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "h w"] | None]:
@@ -47,7 +42,7 @@ def read_photograph(
     transparent it shows `BACKGROUND` and no object, whatever the mask file says. There is no mask
     where the picture is opaque and has no mask file.
     """
-    picture = _checked(read_turned(path, size, operator.eq), _EIGHT_BIT_MODES, path)
+    picture = _require_mode(read_turned(path, size, operator.eq), _EIGHT_BIT_MODES, path)
     alpha = None
     if picture.has_transparency_data:
         picture = picture.convert("RGBA")
@@ -92,7 +87,7 @@ def read_depth_mask(path: Path, size: tuple[int, int]) -> Float[Tensor, "h w"]:
 
 def read_sixteen_bit(path: Path, size: tuple[int, int]) -> Shaped[np.ndarray, "h w"]:
     """The raw values, uint16, of a greyscale PNG of 16 bits a pixel, resampled to `size`."""
-    picture = _checked(read_turned(path, size, same_view), _SIXTEEN_BIT_MODES, path)
+    picture = _require_mode(read_turned(path, size, same_view), _SIXTEEN_BIT_MODES, path)
     return _nearest(np.asarray(picture).astype(np.uint16), size)
 
 
@@ -104,7 +99,7 @@ def read_depth(path: Path, size: tuple[int, int], scale: float) -> Float[Tensor,
     if path.suffix.lower() == ".npy":
         raw = _read_npy(path, size)
     else:
-        raw = np.asarray(_checked(read_turned(path, size, same_view), _DEPTH_MODES, path))
+        raw = np.asarray(_require_mode(read_turned(path, size, same_view), _DEPTH_MODES, path))
     return known_depth(_nearest(raw, size), scale, path)
 
 
@@ -131,7 +126,7 @@ def known_depth(raw: Shaped[np.ndarray, "h w"], scale: float, path: Path) -> Flo
 
 def _read_mask(path: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "h w"]:
     """Grey values; what is transparent is black."""
-    picture = _checked(read_turned(path, size, same_view), _EIGHT_BIT_MODES, path)
+    picture = _require_mode(read_turned(path, size, same_view), _EIGHT_BIT_MODES, path)
     if picture.has_transparency_data:
         picture = picture.convert("RGBA")
         black = Image.new("RGBA", picture.size, (0, 0, 0, 255))
@@ -167,7 +162,7 @@ def _nearest(pixels: Shaped[np.ndarray, "h w"], size: tuple[int, int]) -> Shaped
     return pixels[rows[:, None], columns]
 
 
-def _checked(picture: Image.Image, modes: tuple[str, ...], path: Path) -> Image.Image:
+def _require_mode(picture: Image.Image, modes: tuple[str, ...], path: Path) -> Image.Image:
     if picture.mode not in modes:
         raise InputError(
             f"{path}: has pixels of kind {picture.mode}, expected one of {', '.join(modes)}; "

@@ -66,7 +66,7 @@ class _Text:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._decode = json.JSONDecoder().raw_decode
-        self._pieces = _decoded(path)
+        self._pieces = _decode_pieces(path)
         self._text, self._at = "", 0
 
     def peek(self) -> str:
@@ -120,7 +120,7 @@ class _Text:
         return length > 0
 
 
-def _decoded(path: Path) -> Iterator[str]:
+def _decode_pieces(path: Path) -> Iterator[str]:
     decoder = codecs.getincrementaldecoder("utf-8-sig")()
     try:
         for piece in _pieces(path):

@@ -48,7 +48,7 @@ LENS_KEYS |= {"cx", "cy"}
 """Every key that is looked at here."""
 
 
-def merged_entry(common: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
+def merge_entry(common: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
     """A frame's keys upon those of all frames; its own spelling of a thing replaces another's."""
     hidden: set[str] = set()
     for spellings in _SPELLINGS:
@@ -74,10 +74,12 @@ def lens_of(entry: dict[str, Any], height: int, width: int) -> Lens:
     if not known:
         raise KeyError("fl_x")
     center = _number(entry, "cx", width / 2), _number(entry, "cy", height / 2)
-    return _distorted(entry, {"fx": known[0], "fy": known[-1], "cx": center[0], "cy": center[1]})
+    return _lens_with_distortion(
+        entry, {"fx": known[0], "fy": known[-1], "cx": center[0], "cy": center[1]}
+    )
 
 
-def _distorted(entry: dict[str, Any], pinhole: dict[str, float]) -> Lens:
+def _lens_with_distortion(entry: dict[str, Any], pinhole: dict[str, float]) -> Lens:
     model, coefficients = entry.get("camera_model", PERSPECTIVE), _coefficients(entry)
     if _is_fisheye(entry, model):
         _require_zero(coefficients, ("p1", "p2", "k5", "k6"), "a fisheye lens")

@@ -3,8 +3,7 @@
 import difflib
 import os
 import posixpath
-from collections.abc import Iterable
-from collections.abc import Sequence as List
+from collections.abc import Iterable, Sequence
 from itertools import islice
 from pathlib import Path
 
@@ -24,7 +23,7 @@ class ListedFiles:
         self.root = root
         self._folders: dict[str, dict[str, list[str]]] = {}
 
-    def find(self, listed: str, suffixes: List[str] = ()) -> str | None:
+    def find(self, listed: str, suffixes: Sequence[str] = ()) -> str | None:
         """The path below the root that `listed` means, None where there is no such file.
 
         Tried in turn: the path itself; `\\` as a stroke; with one of the `suffixes` added; and each
@@ -83,7 +82,7 @@ def _is_file(path: Path) -> bool:
         return False
 
 
-def _look_alike(name: str, names: Iterable[List[str]]) -> str | None:
+def _look_alike(name: str, names: Iterable[Sequence[str]]) -> str | None:
     """A name of the same stem, else one that differs in little."""
     few = [other for alike in islice(names, _MOST_COMPARED) for other in alike]
     stem = posixpath.splitext(name)[0].casefold()

@@ -8,7 +8,7 @@ import numpy as np
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from extrap_train.data.examples import Example, ExampleReader, linspace_indices, mirror
-from extrap_train.geometry.reduction import reduced_batch
+from extrap_train.geometry.reduction import reduce_batch
 from extrap_train.geometry.warp import warp_references
 from extrap_train.views import PairBatch
 
@@ -37,7 +37,7 @@ def compute_warp(batch: PairBatch, image_size: int | None = None) -> PairBatch:
     factor, rest = divmod(batch.camera.height, image_size or batch.camera.height)
     if rest or not factor:
         raise ValueError(f"{batch.camera.height} pixels are no multiple of {image_size}")
-    return reduced_batch(replace(batch, warp=warp), factor)
+    return reduce_batch(replace(batch, warp=warp), factor)
 
 
 class PositionSampler(Sampler[Positions]):

@@ -2,8 +2,7 @@
 
 import logging
 import posixpath
-from collections.abc import Callable
-from collections.abc import Sequence as List
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from extrap_train.data.camera_check import PoseConvention, find_pose_fault
 from extrap_train.data.listed_files import PICTURE_SUFFIXES, ListedFiles
 from extrap_train.data.photograph_loader import DepthFile, PhotographLoader
 from extrap_train.data.picture_files import image_size, same_view
-from extrap_train.data.sequences import Frame, PointCloud, Sequence
+from extrap_train.data.sequences import Frame, FrameSequence, PointCloud
 from extrap_train.data.validation import require_sound
 from extrap_train.errors import InputError
 from extrap_train.geometry.lens import Lens
@@ -57,11 +56,11 @@ class Listed:
 def sequence_of_photographs(
     files: ListedFiles,
     name: str,
-    listed: List[Listed],
+    listed: Sequence[Listed],
     description: Path,
     convention: PoseConvention,
     point_cloud: PointCloud | None = None,
-) -> Sequence:
+) -> FrameSequence:
     """A sequence of the photographs below `files.root`, in the order of their paths.
 
     `description` is the file that lists them. Entries without a picture, and those that cannot be
@@ -94,7 +93,7 @@ def sequence_of_photographs(
         log.warning(say, description, len(resized), resized[0])
     if fault := find_pose_fault(stack_poses([frame.camera for frame in frames]), convention):
         raise InputError(f"{description}: {fault}")
-    return Sequence(
+    return FrameSequence(
         CATEGORY,
         name,
         tuple(frames),
@@ -105,7 +104,7 @@ def sequence_of_photographs(
 
 
 def _find_pictures(
-    files: ListedFiles, listed: List[Listed], description: Path
+    files: ListedFiles, listed: Sequence[Listed], description: Path
 ) -> list[tuple[str, Listed | None]]:
     """The entries by the paths of their pictures, in order; None for one whose picture is missing.
 
@@ -145,7 +144,7 @@ def _normal(listed: str) -> str:
     return posixpath.normpath(listed.replace("\\", "/"))
 
 
-def _frame_names(paths: List[str]) -> list[str]:
+def _frame_names(paths: Sequence[str]) -> list[str]:
     """File names where these are unique, else whole paths with the folders joined by `_`."""
     names = [Path(path).name for path in paths]
     if len(set(names)) == len(names):

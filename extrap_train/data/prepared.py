@@ -161,7 +161,7 @@ class PreparedData:
                 tables["pairs"].to_pandas(),
             )
         except (KeyError, ValueError, TypeError, IndexError) as error:
-            raise _damaged(folder, f"a column is missing or odd: {error}") from None
+            raise _damaged_error(folder, f"a column is missing or odd: {error}") from None
 
     def pairs(self, split: str) -> Pairs:
         """The pairs of `train` or `test`, sequence by sequence, best score first."""
@@ -213,8 +213,8 @@ class PreparedData:
     def flows(
         self, sequence: str, references: Sequence[int], query: int
     ) -> Float[Tensor, "k 2 g g"]:
-        """Where the warp of each reference really belongs in the query (`geometry.flow`); zero
-        where it stays as it is."""
+        """Where the warp of each reference really belongs in the query (`geometry.spline_flow`);
+        zero where it stays as it is."""
         numbers = self._flow_numbers(sequence)[list(references), query]
         stored = self._flows(sequence)
         chosen = np.zeros((len(numbers), *stored.shape[1:]), np.float32)
@@ -233,9 +233,9 @@ class PreparedData:
     def _open_flows(self, sequence: str) -> np.ndarray:
         folder = pairs_folder(self._pairs_root, sequence, self.roles[sequence])
         grid = self.manifest["options"].get("correction_grid")
-        flows = _mapped(folder / FLOWS, folder)
+        flows = _map_array(folder / FLOWS, folder)
         if flows.shape[1:] != (2, grid, grid) or flows.dtype != np.float16:
-            raise _damaged(folder, f"flows are {flows.shape}")
+            raise _damaged_error(folder, f"flows are {flows.shape}")
         return flows
 
     def _open_arrays(self, sequence: str) -> Arrays:
@@ -243,12 +243,14 @@ class PreparedData:
         folder = frames_folder(self._frames_root, sequence, is_lone)
         count = self._rows[sequence].stop - self._rows[sequence].start
         square = (count, self.image_size, self.image_size)
-        images, depths, masks = (_mapped(folder / name, folder) for name in (IMAGES, DEPTHS, MASKS))
+        images, depths, masks = (
+            _map_array(folder / name, folder) for name in (IMAGES, DEPTHS, MASKS)
+        )
         kinds = (images.dtype, depths.dtype, masks.dtype)
         if images.shape != (*square, 3) or depths.shape != square or masks.shape != square:
-            raise _damaged(folder, f"frames are not {square}")
+            raise _damaged_error(folder, f"frames are not {square}")
         if kinds != (np.uint8, np.float16, np.uint8):
-            raise _damaged(folder, "frames are of other types")
+            raise _damaged_error(folder, "frames are of other types")
         return images, depths, masks
 
     def __reduce__(self) -> tuple[Callable[[Path], "PreparedData"], tuple[Path]]:
@@ -264,7 +266,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     manifest = read_record(file, _Manifest, _REMEDY)
     size = manifest.options.get("image_size")
     if manifest.format != FORMAT or type(size) is not int:
-        raise _damaged(folder, f"{file} is no manifest of format {FORMAT}")
+        raise _damaged_error(folder, f"{file} is no manifest of format {FORMAT}")
     return asdict(manifest)
 
 
@@ -281,27 +283,27 @@ def _read_table(folder: Path, name: str, manifest: dict[str, Any]) -> pa.Table:
     """A table as it was written: what is damaged is never parsed."""
     file = folder / f"{name}.parquet"
     if table_digest(file) != manifest["tables"].get(name):
-        raise _damaged(folder, f"{file} is missing or was changed")
+        raise _damaged_error(folder, f"{file} is missing or was changed")
     try:
         words = [name for name in _REPEATED if name in pq.read_schema(file).names]
         return pq.read_table(file, read_dictionary=words).combine_chunks()
     except (OSError, pa.ArrowException) as error:
         reason = str(error).splitlines()[0]
-        raise _damaged(folder, f"{file}: {reason}") from None
+        raise _damaged_error(folder, f"{file}: {reason}") from None
 
 
-def _damaged(folder: Path, what: str) -> InputError:
+def _damaged_error(folder: Path, what: str) -> InputError:
     return InputError(f"{folder} is damaged ({what}); {_REMEDY}")
 
 
-def _mapped(file: Path, folder: Path) -> np.ndarray:
+def _map_array(file: Path, folder: Path) -> np.ndarray:
     """An array on disk, of which no more is asked for than the file holds."""
     try:
         mapped: np.ndarray = np.load(file, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError, TypeError, OverflowError) as error:
-        raise _damaged(folder, f"{file.name}: {' '.join(str(error).split())[:200]}") from None
+        raise _damaged_error(folder, f"{file.name}: {' '.join(str(error).split())[:200]}") from None
     if not isinstance(mapped, np.memmap):  # a zip archive
-        raise _damaged(folder, f"{file.name} is no array")
+        raise _damaged_error(folder, f"{file.name} is no array")
     return mapped
 
 

@@ -6,9 +6,9 @@ from extrap_train.config import SyntheticConfig
 from extrap_train.data.camera_check import CO3D_POSES, find_pose_fault
 from extrap_train.data.co3d import read_sequence
 from extrap_train.data.colmap_model import find_model, read_model
-from extrap_train.data.posed import TRANSFORMS, read_transforms
-from extrap_train.data.sequences import Sequence
+from extrap_train.data.sequences import FrameSequence
 from extrap_train.data.synthetic.capture import synthetic_sequence
+from extrap_train.data.transforms_json import TRANSFORMS, read_transforms
 from extrap_train.errors import InputError
 from extrap_train.views import stack_poses
 
@@ -20,7 +20,7 @@ KNOWN_FORMS = (
 )
 
 
-def open_scene(spec: str, synthetic: SyntheticConfig | None = None) -> Sequence:
+def open_scene(spec: str, synthetic: SyntheticConfig | None = None) -> FrameSequence:
     """The capture that `spec` names; raises InputError that lists the known forms otherwise.
 
     `synthetic` says how many frames, of what size and from which seed a synthetic capture has; its
@@ -30,7 +30,7 @@ def open_scene(spec: str, synthetic: SyntheticConfig | None = None) -> Sequence:
         return _open_synthetic(spec, synthetic or SyntheticConfig())
     if spec.startswith(CO3D_SCHEME):
         return _open_co3d(spec)
-    folder = _expanded(spec)
+    folder = _expand_home(spec)
     if not folder.is_dir():
         raise InputError(f"scene {spec!r}: no such folder; give {KNOWN_FORMS}")
     if (folder / TRANSFORMS).is_file():
@@ -46,10 +46,10 @@ def scene_address(spec: str) -> str:
     if spec.startswith(SYNTHETIC_SCHEME):
         return spec
     scheme = CO3D_SCHEME if spec.startswith(CO3D_SCHEME) else ""
-    return f"{scheme}{_expanded(spec.removeprefix(scheme)).resolve()}"
+    return f"{scheme}{_expand_home(spec.removeprefix(scheme)).resolve()}"
 
 
-def _expanded(spec: str) -> Path:
+def _expand_home(spec: str) -> Path:
     """`~` and `~NAME` as a home folder, if there is one of that name."""
     try:
         return Path(spec).expanduser()
@@ -57,8 +57,8 @@ def _expanded(spec: str) -> Path:
         return Path(spec)
 
 
-def _open_co3d(spec: str) -> Sequence:
-    path = _expanded(spec.removeprefix(CO3D_SCHEME))
+def _open_co3d(spec: str) -> FrameSequence:
+    path = _expand_home(spec.removeprefix(CO3D_SCHEME))
     if len(path.parts) < 3:
         raise InputError(f"scene {spec!r}: is not co3d:ROOT/category/sequence; give all three")
     sequence = read_sequence(path.parent.parent, path.parent.name, path.name)
@@ -68,7 +68,7 @@ def _open_co3d(spec: str) -> Sequence:
     return sequence
 
 
-def _open_synthetic(spec: str, options: SyntheticConfig) -> Sequence:
+def _open_synthetic(spec: str, options: SyntheticConfig) -> FrameSequence:
     category, _, number = spec.removeprefix(SYNTHETIC_SCHEME).partition("/")
     if not (number.isascii() and number.isdigit()):
         raise InputError(f"scene {spec!r}: is not synthetic:category/NUMBER, as hydrant/0003")

@@ -71,7 +71,7 @@ class ScenePairs:
 
     def training_batch(self, size: int, rng: np.random.Generator) -> PairBatch:
         """See `AdaptationPairs.training_batch`; each has one to `most_references` references."""
-        drawn = _drawn(len(self.training), size, rng)
+        drawn = _draw_indices(len(self.training), size, rng)
         counts = rng.integers(1, self.most_references + 1, size)
         examples = [
             self._example(self.training[place], int(count), rng)
@@ -120,7 +120,7 @@ class VirtualPairs:
 
     def training_batch(self, size: int, rng: np.random.Generator) -> PairBatch:
         """See `AdaptationPairs.training_batch`; inputs farther than it stand beside a reference."""
-        drawn = _drawn(len(self.training), size, rng)
+        drawn = _draw_indices(len(self.training), size, rng)
         examples = [self._example(self.training[place], rng) for place in drawn]
         return collate(examples, self.most_references)
 
@@ -139,7 +139,7 @@ class VirtualPairs:
         return self._views.example(pair.query, [pair.view], further)
 
 
-def _drawn(count: int, size: int, rng: np.random.Generator) -> list[int]:
+def _draw_indices(count: int, size: int, rng: np.random.Generator) -> list[int]:
     """`size` of `count` places, each as often as any other but for the last round."""
     rounds = -(-size // count)
     return np.concatenate([rng.permutation(count) for _ in range(rounds)])[:size].tolist()

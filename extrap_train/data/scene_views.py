@@ -1,6 +1,6 @@
 """A scene's posed views as a model takes them: framed, sized and with depth."""
 
-from collections.abc import Sequence as ListOf
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from extrap_train.data.sequences import Frame, Sequence
+from extrap_train.data.sequences import Frame, FrameSequence
 from extrap_train.data.square_frames import make_frames, object_square
 from extrap_train.depth import DepthSource
 from extrap_train.errors import InputError, did_you_mean
@@ -16,7 +16,9 @@ from extrap_train.geometry.viewpoints import camera_centers, farthest_point_samp
 from extrap_train.views import View, stack_poses
 
 
-def choose_frames(sequence: Sequence, names: ListOf[str], count: int | None) -> list[int]:
+def select_input_frames(
+    sequence: FrameSequence, names: Sequence[str], count: int | None
+) -> list[int]:
     """Indices of a scene's input frames, in their order.
 
     The frames that are named; else `count` spread by farthest point sampling of the positions; else
@@ -38,7 +40,7 @@ def choose_frames(sequence: Sequence, names: ListOf[str], count: int | None) -> 
 
 
 def input_views(
-    sequence: Sequence, chosen: ListOf[int], source: DepthSource, size: int
+    sequence: FrameSequence, chosen: Sequence[int], source: DepthSource, size: int
 ) -> list[View]:
     """The chosen frames as preparation makes them, `size` pixels square, with depth.
 
@@ -59,7 +61,7 @@ def input_views(
     ]
 
 
-def target_views(frames: ListOf[Frame], size: int) -> list[View]:
+def target_views(frames: Sequence[Frame], size: int) -> list[View]:
     """Frames framed in the same way, without depth: what a generated view is compared with."""
     loaded = [replace(frame.load(depth=False), name=frame.name) for frame in frames]
     return [object_square(view, size) for view in loaded]

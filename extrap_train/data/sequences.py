@@ -1,6 +1,6 @@
 """Captures on disk: a sequence of posed frames, read lazily, whatever the format they came in."""
 
-from collections.abc import Sequence as ListOf
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -53,12 +53,12 @@ class PointCloud:
 
 
 @dataclass(frozen=True)
-class Sequence:
+class FrameSequence:
     """A capture of one scene."""
 
     category: str
     name: str
-    frames: ListOf[Frame]
+    frames: Sequence[Frame]
     """In the order in which they were taken."""
     left_out: tuple[str, ...] = ()
     """Why others, which the capture lists, are none of them: a reason for each."""

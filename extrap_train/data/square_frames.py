@@ -3,7 +3,7 @@
 import hashlib
 import json
 import logging
-from collections.abc import Sequence as ListOf
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +14,7 @@ from torch import Tensor
 from extrap_train.data.frame_files import SequenceFrames
 from extrap_train.data.images import to_eight_bits
 from extrap_train.data.paths import file_stamp
-from extrap_train.data.sequences import Sequence
+from extrap_train.data.sequences import FrameSequence
 from extrap_train.depth import DepthSource, NoDepthError
 from extrap_train.errors import InputError
 from extrap_train.views import View, stack_cameras
@@ -42,7 +42,7 @@ class CaptureKeys:
     """Of their sizes alone: the same for a copy."""
 
     @classmethod
-    def of(cls, sequence: Sequence) -> "CaptureKeys":
+    def of(cls, sequence: FrameSequence) -> "CaptureKeys":
         """Looks at every file's entry in its folder."""
         content, files, sizes = hashlib.sha256(), hashlib.sha256(), hashlib.sha256()
         for frame in sequence.frames:
@@ -61,13 +61,13 @@ class CaptureKeys:
         return hashlib.sha256(json.dumps(made_from).encode()).hexdigest()
 
 
-def held_out(frames: int) -> Bool[np.ndarray, " n"]:
+def held_out_mask(frames: int) -> Bool[np.ndarray, " n"]:
     """Which frames of a lone sequence are for testing."""
     return np.arange(frames) % HELD_OUT_EVERY == HELD_OUT_EVERY - 1
 
 
 def make_frames(
-    sequence: Sequence, depth_source: DepthSource, image_size: int, lone: bool
+    sequence: FrameSequence, depth_source: DepthSource, image_size: int, lone: bool
 ) -> SequenceFrames:
     """Read a sequence as squares around the object, with depth, at the store's size.
 
@@ -83,7 +83,7 @@ def make_frames(
     if all(view.mask is not None and not view.mask.any() for view in views):
         raise InputError(f"{where}: the masks are all black; remove them or the sequence")
     depths = torch.zeros(len(views), image_size, image_size)
-    helping = (~held_out(len(views)) if lone else np.ones(len(views), bool)).nonzero()[0]
+    helping = (~held_out_mask(len(views)) if lone else np.ones(len(views), bool)).nonzero()[0]
     try:
         maps = depth_source.depth_maps([views[i] for i in helping])
     except NoDepthError as error:
@@ -112,7 +112,7 @@ def _remedy(source: DepthSource) -> str:
     return "are its photographs blank, or its poses wrong? Mend or remove it"
 
 
-def _usable_views(sequence: Sequence, where: str, size: int, *, depth: bool) -> list[View]:
+def _usable_views(sequence: FrameSequence, where: str, size: int, *, depth: bool) -> list[View]:
     views, reasons = [], list(sequence.left_out)
     for frame in sequence.frames:
         try:
@@ -126,7 +126,7 @@ def _usable_views(sequence: Sequence, where: str, size: int, *, depth: bool) -> 
     return views
 
 
-def too_many_unusable(reasons: ListOf[str], sequence: Sequence) -> str:
+def too_many_unusable(reasons: Sequence[str], sequence: FrameSequence) -> str:
     """Why a sequence is not trusted with these unusable frames, one reason each; empty if it is."""
     count = len(sequence.frames) + len(sequence.left_out)
     if len(reasons) <= MOST_UNUSABLE_SHARE * count:

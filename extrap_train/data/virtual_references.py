@@ -9,7 +9,7 @@ from jaxtyping import Float
 from extrap_train.data.module import compute_warp
 from extrap_train.data.queries import query_batch
 from extrap_train.geometry.fill import fill_holes
-from extrap_train.geometry.orbits import turned_cameras
+from extrap_train.geometry.orbits import turn_camera
 from extrap_train.geometry.viewpoints import camera_centers, common_center
 from extrap_train.views import View, stack_cameras
 
@@ -41,7 +41,7 @@ def virtual_references(views: Sequence[View], count: int, seed: int) -> list[Vir
         shares = (np.arange(count) + rng.uniform(size=count)) / count
         angles = _NEAREST_RAD + (_FARTHEST_RAD - _NEAREST_RAD) * shares
         sides = np.where(np.arange(count) % 2, 1.0, -1.0)
-        cameras = turned_cameras(view.camera, pivots[query], axis, angles * sides)
+        cameras = turn_camera(view.camera, pivots[query], axis, angles * sides)
         batch, _ = query_batch([view], cameras, 1, view.camera.height)
         warp = compute_warp(batch).warp
         assert warp is not None

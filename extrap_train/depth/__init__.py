@@ -13,7 +13,7 @@ from torch import Tensor
 
 from extrap_train.errors import InputError
 from extrap_train.geometry.cameras import transform, unproject
-from extrap_train.views import View
+from extrap_train.views import View, resample_surfaces
 
 RELIABLE_CONFIDENCE = 0.3
 """Least confidence of a depth to be used: about half of what lies below is wrong, little above."""
@@ -44,6 +44,13 @@ class DepthMap:
     def reliable(self, least_confidence: float = RELIABLE_CONFIDENCE) -> Float[Tensor, "h w"]:
         """Depth, and 0 (unknown) where the confidence is lower."""
         return torch.where(self.confidence >= least_confidence, self.depth, 0)
+
+    def resized(self, height: int, width: int) -> "DepthMap":
+        """The map at another size: interpolated on a surface, by the nearest pixel at its edges."""
+        if self.depth.shape == (height, width):
+            return self
+        both = torch.stack([self.depth, self.confidence])
+        return DepthMap(*resample_surfaces(both, (height, width)))
 
 
 def point_maps_of(

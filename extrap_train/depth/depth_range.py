@@ -49,15 +49,17 @@ def inverse_depth_range(
         pixels_at_one = float(camera.intrinsics[0, 0]) * max(baseline, LEAST_BASELINE)
         greatest = WIDEST_DISPARITY * longer / pixels_at_one
         least = greatest / 100
-    return _seen(camera, neighbours, torch.linspace(least, greatest, 200))
+    return _visible_range(camera, neighbours, torch.linspace(least, greatest, 200))
 
 
-def _seen(
+def _visible_range(
     camera: Camera, neighbours: list[Camera], candidates: Float[Tensor, " d"]
 ) -> tuple[float, float]:
     small = camera.resized(16, 16)
     inverse_depth = candidates.to(camera.intrinsics)[:, None, None].expand(-1, 16, 16)
-    seen = [projection_between(small, other).normalised(inverse_depth)[1] for other in neighbours]
+    seen = [
+        projection_between(small, other).normalised_points(inverse_depth)[1] for other in neighbours
+    ]
     share = torch.stack(seen).any(0).float().mean((-2, -1))
     used = (share.cpu() >= LEAST_SEEN).nonzero().flatten().tolist()
     if not used:

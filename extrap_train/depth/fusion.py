@@ -13,7 +13,7 @@ SAME_DEPTH = math.log(1.05)
 """Estimates whose logarithms differ by more mean different surfaces."""
 
 
-def fused(estimates: Sequence[DepthMap]) -> DepthMap:
+def fuse_depth_maps(estimates: Sequence[DepthMap]) -> DepthMap:
     """The confidence-weighted median of each pixel, then the mean of the estimates that agree.
 
     Confidence is the mean of those that agree times their share of the weight. Unknown where all

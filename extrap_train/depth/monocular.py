@@ -8,13 +8,13 @@ from typing import Protocol, runtime_checkable
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn import functional
 
 from extrap_train.config import MonocularConfig
 from extrap_train.depth import DepthMap, PointMaps, point_maps_of
 from extrap_train.depth.line_fit import robust_line
 from extrap_train.depth.neighbours import WIDEST_RAD, neighbours_of
 from extrap_train.errors import InputError
+from extrap_train.geometry.resample import sample_pixels
 from extrap_train.geometry.triangulation import triangulate
 from extrap_train.matching import Matcher
 from extrap_train.views import View, combine
@@ -89,18 +89,18 @@ class MonocularDepth:
         InputError if too few points of it are found in them, or these contradict the network.
         """
         helpers = self._neighbours([view, *neighbours])[0]
-        return self._aligned(view, [neighbours[i - 1] for i in helpers])
+        return self._align(view, [neighbours[i - 1] for i in helpers])
 
     def depth_maps(self, views: Sequence[View]) -> list[DepthMap]:
         """The depth of every view; 0, unknown, where `depth_map` would raise, and a warning why."""
         return [
-            self._aligned_or_unknown(view, [views[j] for j in helpers])
+            self._align_or_unknown(view, [views[j] for j in helpers])
             for view, helpers in zip(views, self._neighbours(views), strict=True)
         ]
 
-    def _aligned_or_unknown(self, view: View, helpers: Sequence[View]) -> DepthMap:
+    def _align_or_unknown(self, view: View, helpers: Sequence[View]) -> DepthMap:
         try:
-            return self._aligned(view, helpers)
+            return self._align(view, helpers)
         except NotAligned as reason:
             LOG.warning("no depth: %s", reason)
             return DepthMap(*torch.zeros_like(view.image[:2]))
@@ -108,7 +108,7 @@ class MonocularDepth:
     def _neighbours(self, views: Sequence[View]) -> list[list[int]]:
         return neighbours_of(views, self.config.neighbours, WIDEST_RAD)
 
-    def _aligned(self, view: View, helpers: Sequence[View]) -> DepthMap:
+    def _align(self, view: View, helpers: Sequence[View]) -> DepthMap:
         """NotAligned where too few points are found, or they are not nearer where it says so."""
         name = view.name or "a view"
         parts = [self._points(view, helper) for helper in helpers]
@@ -121,7 +121,7 @@ class MonocularDepth:
             )
         points = combine(parts, lambda tensors: torch.cat(list(tensors)))
         predicted = self.network.inverse_depth(view.image)
-        at_points = _sample(predicted, points.pixels)
+        at_points = sample_pixels(predicted[None], points.pixels)[0]
         line = robust_line(at_points, 1 / points.depth, points.weights)
         if line is None:
             raise NotAligned(
@@ -155,13 +155,3 @@ class MonocularDepth:
         # The error of an inverse depth is the pixel's over the parallax.
         weights = matches.confidence * found.parallax_rad.square()
         return _Points(matches.first[good], found.depth[good], weights[good])
-
-
-def _sample(values: Float[Tensor, "h w"], pixels: Float[Tensor, "n 2"]) -> Float[Tensor, " n"]:
-    size = pixels.new_tensor([values.shape[1], values.shape[0]])
-    return functional.grid_sample(
-        values[None, None],
-        (pixels / size * 2 - 1)[None, None],
-        padding_mode="border",
-        align_corners=False,
-    )[0, 0, 0]

@@ -37,7 +37,7 @@ class Projection:
         scale = homogeneous[..., 2]
         return homogeneous[..., :2] / scale.clamp_min(1e-6)[..., None], scale
 
-    def normalised(
+    def normalised_points(
         self, inverse_depth: Float[Tensor, "*d h w"]
     ) -> tuple[Float[Tensor, "*d h w 2"], Bool[Tensor, "*d h w"]]:
         """Normalised coordinates in the target, and whether they lie inside it, in front of it."""
@@ -96,7 +96,7 @@ class PhotoCost:
     def _against(
         self, projection: Projection, image: Float[Tensor, "c h2 w2"], inverse_depth: Tensor
     ) -> Float[Tensor, "d h w"]:
-        coordinates, inside = projection.normalised(inverse_depth)
+        coordinates, inside = projection.normalised_points(inverse_depth)
         warped = functional.grid_sample(
             image[None].expand(len(coordinates), -1, -1, -1),
             coordinates,

@@ -25,15 +25,15 @@ class Estimate:
     """Depth of one view from matching alone, before it is checked against other views."""
 
     inverse_depth: Float[Tensor, "h w"]
-    likeness: Float[Tensor, "h w"]
-    """Correlation of the windows, from 0 (no better than chance, or no texture) to 1."""
+    correlation: Float[Tensor, "h w"]
+    """Of the windows, from 0 (no better than chance, or no texture) to 1."""
 
 
 def sweep(view: View, neighbours: list[View], bounds: tuple[float, float], planes: int) -> Estimate:
     """Estimate the view's inverse depth within `bounds`, at the view's resolution."""
     step = (bounds[1] - bounds[0]) / (planes - 1)
     halvings = _halvings(view, neighbours, step, bounds)
-    small, small_neighbours = _halved(view, halvings), [_halved(n, halvings) for n in neighbours]
+    small, small_neighbours = _halve(view, halvings), [_halve(n, halvings) for n in neighbours]
     hypotheses = torch.linspace(*bounds, planes, device=view.image.device)
     shape = (planes, small.camera.height, small.camera.width)
     cost = PhotoCost(small, small_neighbours)(hypotheses[:, None, None].expand(shape))
@@ -41,13 +41,13 @@ def sweep(view: View, neighbours: list[View], bounds: tuple[float, float], plane
     inverse_depth = bounds[0] + step * _best_index(cost)[0]
     width = step
     for halving in range(halvings, -1, -1):
-        level, others = _halved(view, halving), [_halved(n, halving) for n in neighbours]
-        estimate = _refined(level, others, inverse_depth, width / 2, bounds)
+        level, others = _halve(view, halving), [_halve(n, halving) for n in neighbours]
+        estimate = _refine(level, others, inverse_depth, width / 2, bounds)
         inverse_depth, width = estimate.inverse_depth, width / 2
     return estimate
 
 
-def _refined(
+def _refine(
     view: View,
     neighbours: list[View],
     start: Float[Tensor, "h w"],
@@ -82,7 +82,7 @@ def _median(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     return windows.median(-1).values
 
 
-def _halved(view: View, times: int) -> View:
+def _halve(view: View, times: int) -> View:
     if times == 0:
         return view
     return view.resized(

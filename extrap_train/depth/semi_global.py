@@ -42,7 +42,7 @@ def _scan(
     total = torch.empty_like(cost)
     total[0] = path = cost[0]
     for i in range(1, len(cost)):
-        before = _shifted(path, shift)
+        before = _shift(path, shift)
         least = before.amin(-1, keepdim=True)
         ends = functional.pad(before, (1, 1), value=torch.inf)
         step = torch.minimum(ends[..., 2:], ends[..., :-2]).add_(SMALL_STEP)
@@ -51,7 +51,7 @@ def _scan(
     return total
 
 
-def _shifted(path: Float[Tensor, "2 lanes d"], shift: int) -> Float[Tensor, "2 lanes d"]:
+def _shift(path: Float[Tensor, "2 lanes d"], shift: int) -> Float[Tensor, "2 lanes d"]:
     """Every lane's predecessor; a lane without one starts a path."""
     if shift == 0:
         return path

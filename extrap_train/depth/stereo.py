@@ -11,8 +11,8 @@ from torch import Tensor
 
 from extrap_train.config import StereoConfig
 from extrap_train.depth import DepthMap, NoDepthError, PointMaps, point_maps_of
-from extrap_train.depth.consistency import agreement, forward_backward_error
 from extrap_train.depth.depth_range import convergence_point, inverse_depth_range
+from extrap_train.depth.left_right_check import agreement, forward_backward_error
 from extrap_train.depth.neighbours import (
     LEAST_RAD,
     LIMIT_RAD,
@@ -20,7 +20,6 @@ from extrap_train.depth.neighbours import (
     neighbours_of,
 )
 from extrap_train.depth.plane_sweep import Estimate, sweep
-from extrap_train.depth.resample import resampled
 from extrap_train.views import View
 
 LOG = logging.getLogger(__name__)
@@ -115,7 +114,8 @@ class PlaneSweepStereo:
         for i in wanted:
             height, width = views[i].camera.height, views[i].camera.width
             if helpers[i]:
-                maps.append(resampled(_checked(i, helpers[i], working, estimates), height, width))
+                checked = _check(i, helpers[i], working, estimates)
+                maps.append(checked.resized(height, width))
             else:
                 maps.append(DepthMap(*views[i].image.new_zeros(2, height, width)))
         return maps
@@ -165,7 +165,7 @@ def _names(views: Sequence[View]) -> str:
     return first + (", …" if len(views) > NAMED else "")
 
 
-def _checked(
+def _check(
     index: int, helpers: list[int], views: list[View], estimates: dict[int, Estimate]
 ) -> DepthMap:
     own = estimates[index]
@@ -178,4 +178,4 @@ def _checked(
         )
         for other in helpers
     ]
-    return DepthMap(1 / own.inverse_depth, own.likeness * agreement(torch.stack(errors)))
+    return DepthMap(1 / own.inverse_depth, own.correlation * agreement(torch.stack(errors)))

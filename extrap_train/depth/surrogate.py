@@ -29,18 +29,18 @@ class AffineSurrogate:
 
     def depth_map(self, view: View, neighbours: Sequence[View]) -> DepthMap:
         """The source's depth `z` as `scale · z / median + shift`, 0 where it is unknown."""
-        return self._mapped(view, self.source.depth_map(view, neighbours))
+        return self._apply_affine(view, self.source.depth_map(view, neighbours))
 
     def depth_maps(self, views: Sequence[View]) -> list[DepthMap]:
         """Every view's depth under its own map."""
         pairs = zip(views, self.source.depth_maps(views), strict=True)
-        return [self._mapped(view, found) for view, found in pairs]
+        return [self._apply_affine(view, found) for view, found in pairs]
 
     def point_maps(self, first: View, second: View) -> PointMaps:
         """InputError: two affine depths have no frame in common."""
         raise InputError("monocular depth has no scale that two views share; use another depth=")
 
-    def _mapped(self, view: View, found: DepthMap) -> DepthMap:
+    def _apply_affine(self, view: View, found: DepthMap) -> DepthMap:
         photograph = np.ascontiguousarray(view.image.numpy(force=True))
         rng = np.random.default_rng([self.seed, zlib.crc32(photograph.tobytes())])
         scale, shift = float(rng.uniform(0.5, 2)), float(rng.uniform(0, 1))

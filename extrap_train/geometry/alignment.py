@@ -70,14 +70,22 @@ class Alignment:
 
 
 def align_view(camera: Camera, edges: Edges) -> Alignment:
-    """Solve for the depth of the (unbatched) new view with everything known frozen."""
+    """Solve for the depth of the (unbatched) new view with everything known frozen (METHOD §5.4).
+
+    Each edge e has a similarity S_e = (s, R, t) from its frame to the world, fitted to the known
+    view's points, and says the depth z_e(p) where S_e of its point is nearest to the ray of pixel
+    p. The new depth is a robust mean of log z_e(p) over the edges.
+    """
     pairs = _pairs(edges)
     usable = (pairs.weight > 0).sum(-1) >= LEAST_PAIRS
+    # min Σ w |S_e⁻¹ x_world − x_edge|², by weighted Procrustes.
     edge_to_world, spread = _similarities(pairs)
     usable &= torch.isfinite(edge_to_world).all(-1).all(-1)
     edge_to_world = torch.where(usable[:, None, None], edge_to_world, torch.eye(4).to(spread))
+    # z_e(p) = r·x / r·r with the ray r = (x, y, 1) of pixel p.
     depths = _depths_along_rays(camera, camera.world_to_cam @ edge_to_world, edges.new_points)
     known = usable[:, None, None] & (depths > 0) & torch.isfinite(depths)
+    # log z(p) = Σ w ρ log z_e / Σ w ρ, ρ Tukey's biweight of the edges' disagreement.
     confidence = torch.where(known, edges.new_confidence, 0)
     depth, agreement = _robust_mean(depths, confidence, _trust(spread, usable))
     count = (confidence > 0).sum(0)

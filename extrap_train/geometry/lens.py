@@ -61,15 +61,15 @@ class Lens:
         if self.is_pinhole or _fills(self, straight, height, width):
             return straight
         low, high = 1.0, MAX_ZOOM
-        if not _fills(self, _zoomed(straight, high), height, width):
+        if not _fills(self, _zoom(straight, high), height, width):
             raise ValueError("the lens distortion cannot be undone: no part of the picture is left")
         for _ in range(_BISECTIONS):
             middle = (low + high) / 2
-            if _fills(self, _zoomed(straight, middle), height, width):
+            if _fills(self, _zoom(straight, middle), height, width):
                 high = middle
             else:
                 low = middle
-        return _zoomed(straight, high)
+        return _zoom(straight, high)
 
 
 def undistort(
@@ -155,7 +155,7 @@ def _folds(lens: Lens, directions: Float[np.ndarray, "n 2"]) -> bool:
     return bool(((moved * directions).sum(-1) <= 0).any())
 
 
-def _zoomed(lens: Lens, zoom: float) -> Lens:
+def _zoom(lens: Lens, zoom: float) -> Lens:
     return replace(lens, fx=lens.fx * zoom, fy=lens.fy * zoom)
 
 

@@ -39,7 +39,7 @@ def orbit_cameras(views: Camera, span_rad: float, count: int) -> Camera:
     )
 
 
-def turned_cameras(
+def turn_camera(
     camera: Camera,
     pivot: Float[np.ndarray, "3"],
     axis: Float[np.ndarray, "3"],

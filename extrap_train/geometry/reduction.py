@@ -16,7 +16,7 @@ WARP_SCALE = 2
 """Side of the warp over that of what is made from it, where no model says it."""
 
 
-def reduced_batch(batch: PairBatch, factor: int) -> PairBatch:
+def reduce_batch(batch: PairBatch, factor: int) -> PairBatch:
     """The batch with everything in it, its warp too, at 1/`factor` of its size.
 
     Colours are averaged; depth, which has edges, is taken from one pixel in each block, half a fine
@@ -35,11 +35,11 @@ def reduced_batch(batch: PairBatch, factor: int) -> PairBatch:
         ).unflatten(0, batch.reference_images.shape[:2]),
         reference_cameras=batch.reference_cameras.resized(*size),
         reference_depths=batch.reference_depths[..., middle::factor, middle::factor],
-        warp=None if batch.warp is None else reduced_warp(batch.warp, factor),
+        warp=None if batch.warp is None else reduce_warp(batch.warp, factor),
     )
 
 
-def reduced_warp(warp: Warp, factor: int) -> Warp:
+def reduce_warp(warp: Warp, factor: int) -> Warp:
     """The warp at 1/`factor` of its size: each block is the mean of its known pixels.
 
     A block with at least one known pixel is known: what a reference reaches is rather shown

@@ -1,10 +1,21 @@
-"""Resampling of images where a published convention asks for a certain kernel."""
+"""Images at other places and sizes."""
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
 
 _LOBES = 3
+
+
+def sample_pixels(
+    planes: Float[Tensor, "c h w"], pixels: Float[Tensor, "*n 2"]
+) -> Float[Tensor, "c ..."]:
+    """Bilinear samples at (u, v), centres at +0.5; outside the image those of its border."""
+    size = pixels.new_tensor([planes.shape[2], planes.shape[1]])
+    at = (pixels / size * 2 - 1).reshape(1, 1, -1, 2)
+    found = functional.grid_sample(planes[None], at, padding_mode="border", align_corners=False)
+    return found.reshape(len(planes), *pixels.shape[:-1])
 
 
 def lanczos_resize(

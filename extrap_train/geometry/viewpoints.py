@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float, Int
 
 from extrap_train.views import Camera
 
-_LOOKS_AT_RAD = np.deg2rad(60)
-"""Between an optical axis and a centre that the camera can be said to look at."""
+LOOKS_AT_RAD = np.deg2rad(60)
+"""Largest angle between an optical axis and a point that the camera is said to look at."""
 _SAME_PLACE = 1e-9
 """Distances below this share of the scene's extent are zero."""
 
@@ -71,7 +71,7 @@ def facing(
 def common_center(cameras: Camera) -> Float[np.ndarray, "3"] | None:
     """The scene's centre if there are two cameras or more and all look at it, else None."""
     center = scene_center(cameras)
-    look_at_it = len(cameras.world_to_cam) > 1 and facing(cameras, center, _LOOKS_AT_RAD).all()
+    look_at_it = len(cameras.world_to_cam) > 1 and facing(cameras, center, LOOKS_AT_RAD).all()
     return center if look_at_it else None
 
 
@@ -99,13 +99,6 @@ def fit_orbit(cameras: Camera) -> Orbit:
     azimuths = np.arctan2(directions @ np.cross(axis, first), directions @ first)
     elevations = np.arcsin(np.clip(directions @ axis, -1.0, 1.0))
     return Orbit(axis, center, azimuths % (2 * np.pi), elevations)
-
-
-def nearest_references(
-    angles_to_query_rad: Float[np.ndarray, " n"], count: int
-) -> Int[np.ndarray, " k"]:
-    """Indices of the `count` views with the smallest angle, nearest first, ties by index."""
-    return np.argsort(angles_to_query_rad, kind="stable")[:count]
 
 
 def references_by_nearness(references: Camera, queries: Camera) -> Int[np.ndarray, "q n"]:

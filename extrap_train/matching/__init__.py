@@ -72,7 +72,7 @@ class Matcher(Protocol):
         ...
 
 
-def known_at(known: Bool[Tensor, "h w"], pixels: Float[Tensor, "n 2"]) -> Bool[Tensor, " n"]:
+def is_known_at(known: Bool[Tensor, "h w"], pixels: Float[Tensor, "n 2"]) -> Bool[Tensor, " n"]:
     """Whether the pixel that holds each point is known; False outside the picture."""
     height, width = known.shape
     u, v = pixels.floor().long().unbind(-1)

@@ -9,8 +9,8 @@ from kornia.feature import ALIKED, match_smnn
 from torch import Tensor
 
 from extrap_train.config import AlikedMatcherConfig
-from extrap_train.matching import Matches, known_at
-from extrap_train.matching.pictures import pixels_of, resized
+from extrap_train.matching import Matches, is_known_at
+from extrap_train.matching.working_size import resize, to_image_pixels
 from extrap_train.weight_files import WeightFile
 
 LARGEST_RATIO = 0.9
@@ -45,7 +45,7 @@ class AlikedMatcher:
             others[pairs[:, 1]].to(first),
             (1 - ratios[:, 0]).to(first),
         )
-        return matches if first_known is None else matches[known_at(first_known, matches.first)]
+        return matches if first_known is None else matches[is_known_at(first_known, matches.first)]
 
     def _features(
         self, image: Float[Tensor, "3 h w"]
@@ -53,9 +53,9 @@ class AlikedMatcher:
         scale = min(1.0, self.config.image_size / max(image.shape[1:]))
         height, width = (max(1, round(side * scale)) for side in image.shape[1:])
         device = next(self.network.parameters()).device
-        working = resized(image.to(device), height, width)
+        working = resize(image.to(device), height, width)
         (found,) = self.network(working[None])
-        return pixels_of(found.keypoints, working.shape, image.shape), found.descriptors
+        return to_image_pixels(found.keypoints, working.shape, image.shape), found.descriptors
 
 
 def read_aliked(path: Path, config: AlikedMatcherConfig, option: str) -> ALIKED:

@@ -12,8 +12,8 @@ from kornia.feature.loftr.loftr import default_cfg
 from torch import Tensor
 
 from extrap_train.config import LoftrMatcherConfig
-from extrap_train.matching import Matches, known_at
-from extrap_train.matching.pictures import grey, pixels_of, resized
+from extrap_train.matching import Matches, is_known_at
+from extrap_train.matching.working_size import resize, to_grey, to_image_pixels
 from extrap_train.weight_files import WeightFile
 
 STRIDE = 8
@@ -43,18 +43,18 @@ class LoftrMatcher:
         one, two = self._working(first), self._working(second)
         found = self.network({"image0": one[None], "image1": two[None]})
         matches = Matches(
-            pixels_of(found["keypoints0"], one.shape, first.shape).to(first),
-            pixels_of(found["keypoints1"], two.shape, second.shape).to(first),
+            to_image_pixels(found["keypoints0"], one.shape, first.shape).to(first),
+            to_image_pixels(found["keypoints1"], two.shape, second.shape).to(first),
             found["confidence"].to(first),
         )
-        return matches if first_known is None else matches[known_at(first_known, matches.first)]
+        return matches if first_known is None else matches[is_known_at(first_known, matches.first)]
 
     def _working(self, image: Float[Tensor, "3 h w"]) -> Float[Tensor, "1 h2 w2"]:
         """Grey, its longer side as trained, both sides cut to the stride by resampling."""
         scale = self.config.image_size / max(image.shape[1:])
         cells = [max(1, int(side * scale) // STRIDE) for side in image.shape[1:]]
         device = next(self.network.parameters()).device
-        return resized(grey(image.to(device))[None], cells[0] * STRIDE, cells[1] * STRIDE)
+        return resize(to_grey(image.to(device))[None], cells[0] * STRIDE, cells[1] * STRIDE)
 
 
 def read_loftr(path: Path, config: LoftrMatcherConfig, option: str) -> LoFTR:

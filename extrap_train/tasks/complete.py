@@ -2,8 +2,7 @@
 
 import sys
 import time
-from collections.abc import Iterator
-from collections.abc import Sequence as List
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -21,9 +20,9 @@ from extrap_train.config import (
 )
 from extrap_train.data.photographs import CATEGORY
 from extrap_train.data.scene import SYNTHETIC_SCHEME, open_scene
-from extrap_train.data.sequences import Frame, Sequence
+from extrap_train.data.sequences import Frame, FrameSequence
 from extrap_train.data.synthetic import SyntheticScene, build_scene
-from extrap_train.depth.build import depth_source
+from extrap_train.depth.sources import depth_source
 from extrap_train.device import advise_on_sampling_memory
 from extrap_train.errors import InputError
 from extrap_train.reconstruction.completion import Step, Workshop, complete, map_of_inputs
@@ -83,7 +82,7 @@ class _Job:
     """A scene and what is to be made of it."""
 
     config: TrainConfig
-    sequence: Sequence
+    sequence: FrameSequence
     truth: SyntheticScene | None
     folder: Path
     inputs: list[int]
@@ -133,7 +132,7 @@ def _job(config: TrainConfig) -> _Job:
     return _Job(config, sequence, truth, folder, inputs, world_unit(stack_poses(cameras)), used)
 
 
-def _check_category(config: TrainConfig, sequence: Sequence) -> None:
+def _check_category(config: TrainConfig, sequence: FrameSequence) -> None:
     """A category's newest model is not to paint another category unasked."""
     own, chosen = sequence.category, config.category.name
     if own in (CATEGORY, chosen):
@@ -174,7 +173,7 @@ def _run(job: _Job, console: Console) -> bool:
     return not missing
 
 
-def _count_missing(known: GlobalMap, queries: List[Query]) -> int:
+def _count_missing(known: GlobalMap, queries: Sequence[Query]) -> int:
     """How many of the queries the map does not have yet."""
     there = {view.view.name for view in known.views}
     return sum(query.name not in there for query in queries)

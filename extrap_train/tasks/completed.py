@@ -2,8 +2,7 @@
 
 import json
 import time
-from collections.abc import Collection
-from collections.abc import Sequence as List
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from extrap_train.config import TrainConfig
-from extrap_train.data.sequences import Frame, Sequence
+from extrap_train.data.sequences import Frame, FrameSequence
 from extrap_train.data.synthetic import SyntheticScene
 from extrap_train.errors import InputError
 from extrap_train.gaussians.fit import Diverged
@@ -52,7 +51,7 @@ class Completed:
     """A map that is whole, and how it came about."""
 
     known: GlobalMap
-    steps: List[Step]
+    steps: Sequence[Step]
     unit: WorldUnit
     truth: SyntheticScene | None
     seconds: dict[str, float]
@@ -62,7 +61,7 @@ class Completed:
 def write_completed(
     done: Completed,
     config: TrainConfig,
-    sequence: Sequence,
+    sequence: FrameSequence,
     workshop: Workshop,
     used: UsedWeights | None,
     folder: Path,
@@ -185,7 +184,7 @@ def _draw_views(known: GlobalMap, path: Path) -> None:
 
 
 def _compare_held_out(
-    done: Completed, config: TrainConfig, sequence: Sequence, workshop: Workshop, folder: Path
+    done: Completed, config: TrainConfig, sequence: FrameSequence, workshop: Workshop, folder: Path
 ) -> tuple[dict[str, float | None] | None, dict[str, str]]:
     """Views generated at the poses of photographs that were no inputs, against these."""
     given = done.known.views[: _count(done.known, GIVEN)]
@@ -236,7 +235,7 @@ def _compare_held_out(
 
 
 def _held_out(
-    given: List[MapView], unit: WorldUnit, sequence: Sequence, known: Collection[str]
+    given: Sequence[MapView], unit: WorldUnit, sequence: FrameSequence, known: Collection[str]
 ) -> list[Frame]:
     """The frames that are not known, and were not taken from where an input was."""
     inputs = stack_cameras([unit.outside(view.camera) for view in given])

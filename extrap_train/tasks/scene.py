@@ -16,7 +16,7 @@ from extrap_train.data.examples import linspace_indices
 from extrap_train.data.scene import scene_address
 from extrap_train.data.scene_pairs import AdaptationPairs, adaptation_pairs
 from extrap_train.data.scene_views import target_views
-from extrap_train.data.sequences import Frame, Sequence
+from extrap_train.data.sequences import Frame, FrameSequence
 from extrap_train.device import advise_on_adapting_memory
 from extrap_train.diffusion.adaptation import Adaptation, adapt
 from extrap_train.diffusion.evaluation import score_images, summarise
@@ -93,7 +93,7 @@ def run(config: TrainConfig) -> Outcome:
 
 
 def _run(
-    config: TrainConfig, sequence: Sequence, result: Claim, used: UsedWeights, console: Console
+    config: TrainConfig, sequence: FrameSequence, result: Claim, used: UsedWeights, console: Console
 ) -> None:
     distance, missing = lpips_or_reason(config.validation.lpips_weights)
     model = trained_model(config).to(device_of(config))
@@ -136,7 +136,7 @@ def _run(
     console.print(f"adapted {used}: {_describe(done, measured)}")
 
 
-def _frames_read(config: TrainConfig, sequence: Sequence) -> list[Frame]:
+def _frames_read(config: TrainConfig, sequence: FrameSequence) -> list[Frame]:
     """The input frames and those that the adapter is measured on."""
     part, chosen = input_frames(config, sequence)
     inputs = [part.frames[i] for i in chosen]
@@ -169,7 +169,7 @@ def _options(config: TrainConfig) -> dict[str, Any]:
 
 def _origin(
     config: TrainConfig,
-    sequence: Sequence,
+    sequence: FrameSequence,
     inputs: SceneInputs,
     used: UsedWeights,
     done: Adaptation,

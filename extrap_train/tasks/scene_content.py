@@ -12,7 +12,7 @@ from typing import Any
 from extrap_train.config import SyntheticConfig, TrainConfig, dotted
 from extrap_train.data.scene import SYNTHETIC_SCHEME, scene_address
 from extrap_train.data.sequences import Frame
-from extrap_train.depth.build import weight_files
+from extrap_train.depth.sources import weight_files
 from extrap_train.store.digests import file_digest
 from extrap_train.store.manifest import Manifest
 from extrap_train.tasks.scene_inputs import required_scene

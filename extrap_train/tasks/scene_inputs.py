@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 from extrap_train.config import SyntheticConfig, TrainConfig
 from extrap_train.data.photographs import CATEGORY
 from extrap_train.data.scene import open_scene
-from extrap_train.data.scene_views import choose_frames, input_views
-from extrap_train.data.sequences import Frame, Sequence
-from extrap_train.depth.build import depth_source
+from extrap_train.data.scene_views import input_views, select_input_frames
+from extrap_train.data.sequences import Frame, FrameSequence
+from extrap_train.depth.sources import depth_source
 from extrap_train.errors import InputError
 from extrap_train.views import View
 
@@ -31,13 +31,13 @@ def required_scene(config: TrainConfig) -> str:
     return config.scene
 
 
-def open_sequence(config: TrainConfig) -> Sequence:
+def open_sequence(config: TrainConfig) -> FrameSequence:
     """The scene's frames, of which no photograph has been read yet."""
     synthetic = config.data if isinstance(config.data, SyntheticConfig) else None
     return open_scene(required_scene(config), synthetic)
 
 
-def label_of(sequence: Sequence) -> str:
+def label_of(sequence: FrameSequence) -> str:
     """The scene's name in a path."""
     if sequence.category == CATEGORY:
         return sequence.name
@@ -45,8 +45,8 @@ def label_of(sequence: Sequence) -> str:
 
 
 def input_frames(
-    config: TrainConfig, sequence: Sequence, query: str | None = None
-) -> tuple[Sequence, list[int]]:
+    config: TrainConfig, sequence: FrameSequence, query: str | None = None
+) -> tuple[FrameSequence, list[int]]:
     """The frames that inputs are chosen from, and the places of those that are; see `open_inputs`.
 
     Reads no photograph. Raises InputError where there are too few.
@@ -57,11 +57,11 @@ def input_frames(
         raise InputError(
             f"scene {config.scene}: {query} is its only frame, and is asked for; give more"
         )
-    return part, choose_frames(part, config.input_frames, config.inputs)
+    return part, select_input_frames(part, config.input_frames, config.inputs)
 
 
 def open_inputs(
-    config: TrainConfig, sequence: Sequence, image_size: int, query: str | None = None
+    config: TrainConfig, sequence: FrameSequence, image_size: int, query: str | None = None
 ) -> SceneInputs:
     """The scene's input views at this size; depth comes from these views alone.
 

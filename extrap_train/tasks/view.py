@@ -4,7 +4,7 @@ The same in Python: `open_generator`, `open_views`, `walk`.
 """
 
 import math
-from collections.abc import Sequence as ListOf
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,12 +19,12 @@ from extrap_train.config import (
     TrainConfig,
     TrainerConfig,
 )
-from extrap_train.data.posed import read_cameras
 from extrap_train.data.scene import open_scene
-from extrap_train.data.scene_views import choose_frames, input_views
-from extrap_train.data.sequences import Sequence
+from extrap_train.data.scene_views import input_views, select_input_frames
+from extrap_train.data.sequences import FrameSequence
 from extrap_train.data.square_frames import object_square
-from extrap_train.depth.build import depth_source
+from extrap_train.data.transforms_json import read_cameras
+from extrap_train.depth.sources import depth_source
 from extrap_train.device import fastest_device
 from extrap_train.diffusion.generator import DiffusionGenerator, GeneratedViews
 from extrap_train.errors import InputError, did_you_mean
@@ -148,7 +148,7 @@ def _compare(
     truth: View | None,
     inputs: SceneInputs,
     config: TrainConfig,
-    sequence: Sequence,
+    sequence: FrameSequence,
 ) -> tuple[float | None, str]:
     """PSNR in dB against the photograph, or why there is none."""
     if truth is None:
@@ -189,12 +189,12 @@ def open_views(
     `depth` is the data set's own by default; `StereoConfig()` estimates it.
     """
     sequence = open_scene(scene)
-    chosen = choose_frames(sequence, (), inputs)
+    chosen = select_input_frames(sequence, (), inputs)
     source = depth_source(depth or DatasetDepthConfig())
     return input_views(sequence, chosen, source, generator.warp_size)
 
 
-def walk(views: ListOf[View], degrees: float, frames: int) -> tuple[Camera, list[str]]:
+def walk(views: Sequence[View], degrees: float, frames: int) -> tuple[Camera, list[str]]:
     """Cameras around what the views look at, from the first view's azimuth on, and their names."""
     _require_orbit(len(views))
     cameras = stack_cameras([view.camera for view in views])
@@ -213,14 +213,14 @@ def _places(frames: int) -> list[str]:
     return [f"{index:03d}" for index in range(frames)]
 
 
-def _as_named(pose: str | None, sequence: Sequence) -> str | None:
+def _as_named(pose: str | None, sequence: FrameSequence) -> str | None:
     """The frame that `pose` names, in the case in which the scene has it."""
     names = [frame.name for frame in sequence.frames if pose is not None]
     alike = [name for name in names if name.casefold() == str(pose).casefold()]
     return alike[0] if len(alike) == 1 else pose
 
 
-def _query(config: TrainConfig, sequence: Sequence) -> _Query:
+def _query(config: TrainConfig, sequence: FrameSequence) -> _Query:
     """InputError where nothing can be painted of what is asked for."""
     if (config.pose is None) == (config.orbit is None):
         raise InputError("task=view needs a pose=FRAME|FILE.json or an orbit=DEGREES, one of both")

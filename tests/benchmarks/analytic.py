@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from benchmarks.methods.base import SceneInputs
-from extrap_train.data.sequences import Frame, Sequence
+from extrap_train.data.sequences import Frame, FrameSequence
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.views import View, stack_cameras
 from tests.scenes import Hit, Scene, orbit_camera, sphere
@@ -48,13 +48,13 @@ def scene_inputs(
     return inputs, torch.stack([view.image for view in targets])
 
 
-def analytic_capture(count: int = 12, size: int = 32, name: str = "one") -> Sequence:
+def analytic_capture(count: int = 12, size: int = 32, name: str = "one") -> FrameSequence:
     """A full turn around the ball on its plane."""
     frames = []
     for index in range(count):
         view = replace(view_at(360 * index / count, size), name=f"{index:03d}.png")
         frames.append(Frame(view.name, view.camera, True, False, _Photograph(view), ()))
-    return Sequence("apple", name, tuple(frames))
+    return FrameSequence("apple", name, tuple(frames))
 
 
 @dataclass(frozen=True)

@@ -18,12 +18,12 @@ from typing import Any
 import pytest
 from captures import view_at, write_capture
 from test_colmap_model import Entry, write_binary, write_text
-from test_posed import write_transforms
+from test_transforms_json import write_transforms
 
 from extrap_train.data.co3d import read_category
 from extrap_train.data.co3d.set_lists import read_sequence_split
-from extrap_train.data.posed import read_cameras
 from extrap_train.data.scene import open_scene
+from extrap_train.data.transforms_json import read_cameras
 from extrap_train.errors import InputError
 
 pytestmark = pytest.mark.slow

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from extrap_train.data.lens_keys import REFUSED, lens_of, merged_entry
+from extrap_train.data.lens_keys import REFUSED, lens_of, merge_entry
 from extrap_train.geometry.lens import Lens, distort
 
 HEIGHT, WIDTH = 96, 128
@@ -134,14 +134,14 @@ def test_keys_that_change_no_lens_are_passed_over():
     ],
 )
 def test_what_a_frame_says_itself_comes_first(common, own, focal):
-    read = lens(**merged_entry(common, own))
+    read = lens(**merge_entry(common, own))
     assert (read.fx, read.fy) == pytest.approx(focal)
 
 
 def test_a_frames_own_spelling_of_the_distortion_replaces_the_other():
     own = {"distortion_params": [0.1, 0, 0, 0, 0, 0]}
-    assert lens(**merged_entry(PINHOLE | RADIAL, own)).distortion[:3] == (0.1, 0, 0)
-    merged = merged_entry(PINHOLE | {"distortion_params": [0.1] * 6}, {"k1": 0.3})
+    assert lens(**merge_entry(PINHOLE | RADIAL, own)).distortion[:3] == (0.1, 0, 0)
+    merged = merge_entry(PINHOLE | {"distortion_params": [0.1] * 6}, {"k1": 0.3})
     assert lens(**merged).distortion == (0.3, *(0.0,) * 7)
-    merged = merged_entry({**PINHOLE, "is_fisheye": True}, {"camera_model": "OPENCV"})
+    merged = merge_entry({**PINHOLE, "is_fisheye": True}, {"camera_model": "OPENCV"})
     assert not lens(**merged).fisheye

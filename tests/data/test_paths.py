@@ -8,7 +8,7 @@ import pytest
 
 from extrap_train.data.json_files import read_json
 from extrap_train.data.paths import check_relative, require_file
-from extrap_train.data.posed import read_transforms
+from extrap_train.data.transforms_json import read_transforms
 from extrap_train.errors import InputError
 
 

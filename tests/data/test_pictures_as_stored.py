@@ -14,7 +14,6 @@ from extrap_train.data import picture_files
 from extrap_train.data.images import (
     read_depth,
     read_depth_mask,
-    read_image,
     read_mask,
     read_photograph,
     read_sixteen_bit,
@@ -39,6 +38,10 @@ _STORED = {
     8: _UPRIGHT[::-1].swapaxes(0, 1),  # left, bottom
 }
 _QUARTER_TURNS = (5, 6, 7, 8)
+
+
+def read_image(path: Path, size: tuple[int, int]) -> torch.Tensor:
+    return read_photograph(path, size)[0]
 
 
 def save_with_tag(path: Path, pixels: np.ndarray, tag: int) -> Path:

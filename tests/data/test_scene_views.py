@@ -5,7 +5,7 @@ import pytest
 import torch
 from orbits import capture, even, ring
 
-from extrap_train.data.scene_views import choose_frames, input_views, target_views
+from extrap_train.data.scene_views import input_views, select_input_frames, target_views
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError
 
@@ -13,16 +13,18 @@ SCENE = capture(ring(even(12)))
 
 
 def test_inputs_are_spread_named_or_all():
-    assert choose_frames(SCENE, (), 3) in ([0, 3, 6], [0, 6, 9]), "a half and a quarter turn away"
-    assert choose_frames(SCENE, (), None) == list(range(12))
-    assert choose_frames(SCENE, ("frame7", "frame2"), 3) == [2, 7]
+    assert select_input_frames(SCENE, (), 3) in ([0, 3, 6], [0, 6, 9]), (
+        "a half and a quarter turn away"
+    )
+    assert select_input_frames(SCENE, (), None) == list(range(12))
+    assert select_input_frames(SCENE, ("frame7", "frame2"), 3) == [2, 7]
 
 
 def test_more_inputs_than_frames_and_unknown_names_are_refused():
     with pytest.raises(InputError, match="has 12 frames, fewer than the 13 asked for"):
-        choose_frames(SCENE, (), 13)
+        select_input_frames(SCENE, (), 13)
     with pytest.raises(InputError, match=r"has no frame fram7; did you mean frame7"):
-        choose_frames(SCENE, ("fram7",), None)
+        select_input_frames(SCENE, ("fram7",), None)
 
 
 def test_views_have_the_models_size_and_their_own_depth():

@@ -6,14 +6,14 @@ import torch
 
 from extrap_train.config import CATEGORIES
 from extrap_train.data.synthetic import build_scene, handheld_orbit, render, surface_points
-from extrap_train.data.synthetic.shapes import moved
+from extrap_train.data.synthetic.shapes import move_mesh
 from extrap_train.errors import InputError
 from extrap_train.geometry.cameras import project
 
 
 def object_vertices(scene):
     parts = [part for part in scene.parts if part.is_object]
-    return np.concatenate([moved(part.mesh, part.part_to_world).vertices for part in parts])
+    return np.concatenate([move_mesh(part.mesh, part.part_to_world).vertices for part in parts])
 
 
 @pytest.mark.parametrize("category", CATEGORIES)

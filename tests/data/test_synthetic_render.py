@@ -14,7 +14,7 @@ from extrap_train.data.synthetic.material import (
     linear_to_srgb,
     srgb_to_linear,
 )
-from extrap_train.data.synthetic.scene import Part, SyntheticScene, placement
+from extrap_train.data.synthetic.parts import Part, SyntheticScene, placement
 from extrap_train.data.synthetic.shapes import ellipsoid, flat_ground
 from extrap_train.geometry.cameras import project, unproject_to_world
 

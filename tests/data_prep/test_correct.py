@@ -13,7 +13,7 @@ from extrap_train.config import FlowMatcherConfig
 from extrap_train.geometry.cameras import project, unproject_to_world
 from extrap_train.geometry.warp import warp_references
 from extrap_train.matching import Matches
-from extrap_train.matching.flow import FlowMatcher
+from extrap_train.matching.dense_flow import FlowMatcher
 from extrap_train.views import Camera, Warp, stack_cameras
 
 SIZE, GRID = 128, 12

@@ -16,7 +16,7 @@ from data_prep.category import prepare_category
 from data_prep.correct import Correction, correct_pair
 from extrap_train.config import Co3dConfig, FlowMatcherConfig, PrepConfig, StereoConfig
 from extrap_train.data.prepared import PreparedData
-from extrap_train.matching.build import matcher
+from extrap_train.matching.matchers import matcher
 
 GATES = (0.0, 0.01, 0.02, 0.05)
 Picture = torch.Tensor

@@ -3,7 +3,7 @@
 `python -m pytest -s -m slow tests/data_prep/test_correction_pays.py` prints the table.
 """
 
-from collections.abc import Sequence as ListOf
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import hydra
@@ -29,7 +29,7 @@ from extrap_train.diffusion.checkpoint import initial_model
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.jobs.local import LocalLauncher
 from extrap_train.matching import Matcher
-from extrap_train.matching.build import matcher
+from extrap_train.matching.matchers import matcher
 from extrap_train.views import View
 
 DATA = SyntheticConfig(train_sequences=10, test_sequences=3)
@@ -42,7 +42,7 @@ class WrongDepth(DatasetDepth):
     """Exact depth times factors of low frequency, up to 1 ± `AMOUNT`, plus noise; of each view its
     own."""
 
-    def depth_maps(self, views: ListOf[View]) -> list[DepthMap]:
+    def depth_maps(self, views: Sequence[View]) -> list[DepthMap]:
         return [
             DepthMap(found.depth * factors(index, found.depth.shape), found.confidence)
             for index, found in enumerate(super().depth_maps(views))

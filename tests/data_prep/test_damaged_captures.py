@@ -4,7 +4,7 @@ import logging
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence as ListOf
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,7 +40,7 @@ class Blind(DatasetDepth):
     def image_size(self) -> int | None:  # type: ignore[override]
         return self.size
 
-    def depth_maps(self, views: ListOf[View]) -> list[DepthMap]:
+    def depth_maps(self, views: Sequence[View]) -> list[DepthMap]:
         return [DepthMap(*torch.zeros_like(view.image[:2])) for view in views]
 
 

@@ -23,7 +23,7 @@ from data_prep.sequence_job import PrepContext, SequenceJob
 from extrap_train.config import DatasetDepthConfig, PrepConfig
 from extrap_train.data import co3d, json_files
 from extrap_train.data.co3d import read_category
-from extrap_train.data.sequences import Sequence
+from extrap_train.data.sequences import FrameSequence
 
 FRAMES = 20
 MOST_BYTES_A_FRAME = 1000
@@ -85,7 +85,7 @@ def test_a_job_takes_its_own_sequence_along_and_no_other(photographs: Path) -> N
         PrepModels(DatasetDepthConfig(), None), PrepConfig(), photographs, photographs
     )
 
-    def job(sequences: list[Sequence]) -> int:
+    def job(sequences: list[FrameSequence]) -> int:
         return len(pickle.dumps(SequenceJob(shop, sequences[0], "train", "key")))
 
     annotate(photographs, 2)

@@ -28,7 +28,7 @@ from extrap_train.config import (
     SyntheticConfig,
 )
 from extrap_train.data.prepared import PreparedData
-from extrap_train.data.sequences import Sequence
+from extrap_train.data.sequences import FrameSequence
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.depth.mast3r.network import Architecture, PointMapNetwork
 from extrap_train.errors import InputError
@@ -56,7 +56,7 @@ def test_a_job_is_small_and_keeps_no_file_open(mast3r: Mast3rConfig, tmp_path: P
     tools = PrepModels(mast3r, LoftrMatcherConfig(checkpoint="loftr.ckpt"))
     shop = PrepContext(tools, PrepConfig(), tmp_path, tmp_path)
     before = open_files()
-    job = ForkingPickler.dumps(SequenceJob(shop, Sequence("cup", "one", ()), "train", "key"))
+    job = ForkingPickler.dumps(SequenceJob(shop, FrameSequence("cup", "one", ()), "train", "key"))
     assert open_files() == before
     assert len(job) < 2000
 

@@ -20,7 +20,7 @@ from data_prep.preparation import prepare
 from extrap_train.config import FlowMatcherConfig, PrepConfig
 from extrap_train.data.prepared import Pairs, PreparedData
 from extrap_train.depth.dataset import DatasetDepth
-from extrap_train.matching.flow import FlowMatcher
+from extrap_train.matching.dense_flow import FlowMatcher
 
 
 @pytest.fixture

@@ -1,7 +1,7 @@
 import json
 import os
 import re
-from collections.abc import Sequence as ListOf
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
@@ -37,7 +37,7 @@ class CountingDepth(DatasetDepth):
     def __repr__(self) -> str:
         return "CountingDepth()"
 
-    def depth_maps(self, views: ListOf[View]) -> list[DepthMap]:
+    def depth_maps(self, views: Sequence[View]) -> list[DepthMap]:
         self.calls[0].append(len(views))
         return super().depth_maps(views)
 
@@ -324,7 +324,7 @@ def test_no_memory_is_the_launchers_to_try_again_not_the_sequences_fault(
 ) -> None:
     @dataclass(frozen=True)
     class Greedy(DatasetDepth):
-        def depth_maps(self, views: ListOf[View]) -> list[DepthMap]:
+        def depth_maps(self, views: Sequence[View]) -> list[DepthMap]:
             raise error
 
     shop = PrepContext(PrepModels(Greedy(), None), OPTIONS, tmp_path, tmp_path)

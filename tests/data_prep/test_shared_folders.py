@@ -21,13 +21,13 @@ from extrap_train.config import (
 )
 from extrap_train.data.frame_files import frames_folder, pairs_folder
 from extrap_train.data.prepared import PreparedData
-from extrap_train.data.sequences import Sequence
+from extrap_train.data.sequences import FrameSequence
 
 OPTIONS = PrepConfig(image_size=16)
 HELD_OUT = [4, 9, 14, 19]
 
 
-def run(root: Path, name: str, sequences: list[Sequence], options: PrepConfig) -> PreparedData:
+def run(root: Path, name: str, sequences: list[FrameSequence], options: PrepConfig) -> PreparedData:
     return prepare(
         sequences,
         DatasetDepthConfig(),
@@ -138,7 +138,7 @@ def test_weights_are_the_same_however_their_path_is_spelt(
 
 def test_a_changed_option_redoes_only_what_depends_on_it(tmp_path: Path) -> None:
     names = ("one", "two", "three", "four")
-    write_capture(tmp_path / "co3d", names, 12)
+    write_capture(tmp_path / "co3d", names, 10)
     output = tmp_path / "outputs"
 
     def prepared(tests: int, **options: object) -> PreparedData:

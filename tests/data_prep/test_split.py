@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from data_prep.split import split_sequences
-from extrap_train.data.square_frames import held_out
+from extrap_train.data.square_frames import held_out_mask
 from extrap_train.errors import InputError
 
 NAMES = [f"cup/{i:04d}" for i in range(20)] + [f"book/{i:04d}" for i in range(12)]
@@ -43,7 +43,7 @@ def test_a_lone_sequence_is_trained_and_tested_on() -> None:
     split = split_sequences(["cup/0000"], 5)
     assert (split.train, split.test, split.lone) == ((), (), ("cup/0000",))
     assert split.role("cup/0000") == "train and test"
-    assert np.flatnonzero(held_out(12)).tolist() == [4, 9]
+    assert np.flatnonzero(held_out_mask(12)).tolist() == [4, 9]
 
 
 def test_the_hash_tells_splits_apart() -> None:

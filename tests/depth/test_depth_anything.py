@@ -17,9 +17,9 @@ from transformers import (
 
 from data_prep.model_cache import PrepModels
 from extrap_train.config import FlowMatcherConfig, MonocularConfig
-from extrap_train.depth.build import depth_source
 from extrap_train.depth.depth_anything import files_read, read_depth_anything
 from extrap_train.depth.monocular import MonocularDepth
+from extrap_train.depth.sources import depth_source
 from extrap_train.errors import InputError
 
 

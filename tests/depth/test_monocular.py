@@ -16,7 +16,7 @@ from extrap_train.geometry.cameras import (
     unproject_to_world,
 )
 from extrap_train.matching import Matches
-from extrap_train.matching.build import matcher
+from extrap_train.matching.matchers import matcher
 
 SCENE = SCENES["box on the ground"]
 

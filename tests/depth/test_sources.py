@@ -6,8 +6,8 @@ from traced_scenes import SCENES, orbit_camera, render
 
 from extrap_train.config import DatasetDepthConfig, DepthConfig, StereoConfig
 from extrap_train.depth import DepthSource
-from extrap_train.depth.build import depth_source
 from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth.sources import depth_source
 from extrap_train.depth.stereo import PlaneSweepStereo
 from extrap_train.errors import InputError
 from extrap_train.geometry.cameras import unproject_to_world

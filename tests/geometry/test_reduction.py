@@ -5,7 +5,7 @@ import math
 import torch
 
 from extrap_train.geometry.cameras import unproject
-from extrap_train.geometry.reduction import reduced_batch, reduced_warp
+from extrap_train.geometry.reduction import reduce_batch, reduce_warp
 from extrap_train.geometry.warp import warp_references
 from extrap_train.views import Camera, PairBatch, Warp
 
@@ -34,7 +34,7 @@ def warp_of(mask: list[list[float]]) -> Warp:
 
 
 def test_a_block_is_the_mean_of_its_known_pixels() -> None:
-    reduced = reduced_warp(warp_of([[1, 0, 0, 0], [1, 1, 0, 0]]), 2)
+    reduced = reduce_warp(warp_of([[1, 0, 0, 0], [1, 1, 0, 0]]), 2)
     assert reduced.mask.tolist() == [[[1, 0]]]
     expected = (0 + 4 + 5) / 3
     torch.testing.assert_close(reduced.image[0, :, 0, 0], torch.full((3,), expected))
@@ -44,7 +44,7 @@ def test_a_block_is_the_mean_of_its_known_pixels() -> None:
 
 
 def test_holes_stay_zero_and_marked() -> None:
-    reduced = reduced_warp(warp_of([[0, 0], [0, 0]]), 2)
+    reduced = reduce_warp(warp_of([[0, 0], [0, 0]]), 2)
     assert not reduced.mask.any()
     assert not reduced.image.any()
 
@@ -67,7 +67,7 @@ def wall(size: int) -> PairBatch:
 
 def test_the_reduced_cameras_see_the_same_rays() -> None:
     """The reduced wall's points are those of the blocks' middles."""
-    whole, half = wall(16), reduced_batch(wall(16), 2)
+    whole, half = wall(16), reduce_batch(wall(16), 2)
     points = unproject(whole.reference_depths[0, 0], whole.reference_cameras[0, 0])
     middles = points.unfold(0, 2, 2).unfold(1, 2, 2).mean((-1, -2))
     found = unproject(half.reference_depths[0, 0], half.reference_cameras[0, 0])
@@ -76,14 +76,14 @@ def test_the_reduced_cameras_see_the_same_rays() -> None:
 
 def test_a_reduced_warp_agrees_with_a_warp_of_reduced_views() -> None:
     """On a smooth wall both ways show the same; only the fine one keeps grazing surfaces whole."""
-    fine, coarse = wall(64), reduced_batch(wall(64), 2)
+    fine, coarse = wall(64), reduce_batch(wall(64), 2)
     warps = [
         warp_references(
             b.reference_images, b.reference_depths, b.reference_cameras, b.reference_valid, b.camera
         )
         for b in (fine, coarse)
     ]
-    reduced = reduced_warp(warps[0], 2)
+    reduced = reduce_warp(warps[0], 2)
     both = (reduced.mask * warps[1].mask)[:, None]
     assert both.mean() > 0.7
     assert ((reduced.image - warps[1].image).abs() * both).max() < 0.05
@@ -91,4 +91,4 @@ def test_a_reduced_warp_agrees_with_a_warp_of_reduced_views() -> None:
 
 def test_a_factor_of_one_changes_nothing() -> None:
     batch = wall(8)
-    assert reduced_batch(batch, 1) is batch
+    assert reduce_batch(batch, 1) is batch

@@ -12,9 +12,7 @@ from extrap_train.geometry.viewpoints import (
     facing,
     farthest_point_sample,
     fit_orbit,
-    nearest_references,
     pairwise_angles,
-    references_by_nearness,
     scene_center,
 )
 from extrap_train.views import Camera
@@ -100,34 +98,6 @@ def test_nearly_collinear_positions_have_a_finite_orbit() -> None:
     orbit = fit_orbit(looking_at(positions, np.zeros(3)))
     assert np.isfinite(orbit.azimuths_rad).all()
     assert abs(orbit.axis[2]) > 0.99
-
-
-def test_nearest_references_come_in_order_with_ties_by_index() -> None:
-    assert nearest_references(np.array([0.3, 0.1, 0.3, 0.2]), 3).tolist() == [1, 3, 0]
-
-
-@pytest.mark.parametrize("radius", [0.3, 1.0, 3.7])
-def test_the_reference_at_the_querys_place_is_the_nearest(radius: float) -> None:
-    """However its cosine is rounded: a little more than 1 has no angle."""
-    camera = ring(even(90), 25, radius)
-    assert references_by_nearness(camera, camera)[:, 0].tolist() == list(range(90))
-
-
-@given(st.integers(0, 1000), st.integers(1, 6))
-@settings(max_examples=40, deadline=None)
-def test_extra_references_keep_the_first_nearest(seed: int, count: int) -> None:
-    rng = np.random.default_rng(seed)
-    camera = ring(even(24))
-    angles = pairwise_angles(camera, scene_center(camera))
-    allowed = np.sort(rng.choice(24, 18, replace=False))
-    query, first = rng.choice(24, 2, replace=False)
-    extra = extra_references(angles, int(query), int(first), count, rng, allowed)
-    behind = angles[query, allowed] >= angles[query, first]
-    assert len(extra) == min(count - 1, int((behind & ~np.isin(allowed, [query, first])).sum()))
-    assert len({*extra, int(query), int(first)}) == len(extra) + 2
-    assert set(extra) <= set(allowed.tolist())
-    order = [angles[query, frame] for frame in (first, *extra)]
-    assert order == sorted(order)
 
 
 def test_extra_references_spread_out() -> None:

@@ -11,7 +11,7 @@ from extrap_train.config import AlikedMatcherConfig
 from extrap_train.data.co3d import read_category
 from extrap_train.errors import InputError
 from extrap_train.matching import Matcher
-from extrap_train.matching.build import matcher
+from extrap_train.matching.matchers import matcher
 
 NEIGHBOURS = ((0, 1), (1, 2), (2, 3), (3, 4), (4, 5), (8, 9))
 """Frames of the apple 2° to 9° apart."""

@@ -10,8 +10,8 @@ from moved_pictures import turned
 from extrap_train.config import LoftrMatcherConfig
 from extrap_train.errors import InputError
 from extrap_train.matching import Matcher
-from extrap_train.matching.build import matcher
 from extrap_train.matching.loftr import LoftrMatcher, read_loftr
+from extrap_train.matching.matchers import matcher
 
 
 @pytest.fixture(scope="module")

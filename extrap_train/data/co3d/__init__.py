@@ -20,7 +20,7 @@ from extrap_train.data.co3d.annotations import (
     read_sequence_annotations,
 )
 from extrap_train.data.co3d.frame_columns import Co3dFrames, is_blackened
-from extrap_train.data.sequences import PointCloud, Sequence
+from extrap_train.data.sequences import FrameSequence, PointCloud
 from extrap_train.errors import InputError, did_you_mean
 
 FRAME_ANNOTATIONS = "frame_annotations.jgz"
@@ -47,7 +47,7 @@ def require_category(root: Path, category: str) -> None:
         raise InputError(f"{root}: has no category {category!r}; categories present: {present}")
 
 
-def read_category(root: Path, category: str) -> list[Sequence]:
+def read_category(root: Path, category: str) -> list[FrameSequence]:
     """All sequences of a category, by name; frames by number, those without a camera left out.
 
     So are those whose camera is degenerate, and the sequences say so; InputError where all are.
@@ -56,7 +56,7 @@ def read_category(root: Path, category: str) -> list[Sequence]:
     file = root / category / FRAME_ANNOTATIONS
     with _collector_paused():
         details = read_sequence_annotations(root / category / SEQUENCE_ANNOTATIONS)
-        posed = _posed_by_sequence(root, file)
+        posed = _group_posed_frames(root, file)
         return [
             # Popped: its parts go as soon as the sequence is made.
             _sequence(root, category, name, posed.pop(name), details.get(name), file)
@@ -88,7 +88,7 @@ class _Posed:
     """Hidden targets of the challenge, which are left out as known and not as damage."""
 
 
-def _posed_by_sequence(root: Path, file: Path) -> dict[str, _Posed]:
+def _group_posed_frames(root: Path, file: Path) -> dict[str, _Posed]:
     """The frames that have a camera; a sequence's entries need not stand together."""
     posed: dict[str, _Posed] = defaultdict(_Posed)
     entries, count = read_frame_annotations(file), 0
@@ -134,7 +134,7 @@ def _take(
     return count
 
 
-def read_sequence(root: Path, category: str, name: str) -> Sequence:
+def read_sequence(root: Path, category: str, name: str) -> FrameSequence:
     """One sequence of a category; InputError where none of its frames can be used."""
     sequences = {sequence.name: sequence for sequence in read_category(root, category)}
     if name not in sequences:
@@ -154,12 +154,12 @@ def _sequence(
     posed: _Posed,
     details: SequenceAnnotation | None,
     file: Path,
-) -> Sequence:
+) -> FrameSequence:
     frames = Co3dFrames.join(posed.parts)
     if frames.has_duplicates:
         raise InputError(f"{file}: sequence {name} lists an image twice; remove the second entry")
     cloud = details.point_cloud_path if details else None
-    return Sequence(
+    return FrameSequence(
         category=category,
         name=name,
         frames=frames,

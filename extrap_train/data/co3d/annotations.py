@@ -53,15 +53,15 @@ class SequenceAnnotation:
 
 def read_frame_annotations(file: Path) -> Iterator[FrameAnnotation]:
     """Every entry of a `frame_annotations.jgz`, in the file's order, one at a time."""
-    return _parsed(file, _frame)
+    return _parse_entries(file, _frame)
 
 
 def read_sequence_annotations(file: Path) -> dict[str, SequenceAnnotation]:
     """The entries of a `sequence_annotations.jgz` by their sequence's name."""
-    return {entry.name: entry for entry in _parsed(file, _sequence)}
+    return {entry.name: entry for entry in _parse_entries(file, _sequence)}
 
 
-def _parsed(file: Path, parse: Callable[[Any, Path], T]) -> Iterator[T]:
+def _parse_entries(file: Path, parse: Callable[[Any, Path], T]) -> Iterator[T]:
     for index, entry in enumerate(read_json_list(file, "annotations")):
         try:
             parsed = parse(entry, file)
@@ -80,18 +80,18 @@ def _parsed(file: Path, parse: Callable[[Any, Path], T]) -> Iterator[T]:
 
 def _frame(entry: Any, file: Path) -> FrameAnnotation:
     image, viewpoint = entry["image"], entry.get("viewpoint")
-    height, width = (_typed(side, int, "image size") for side in image["size"])
+    height, width = (_require_type(side, int, "image size") for side in image["size"])
     if not (0 < height <= MAX_PIXELS and 0 < width <= MAX_PIXELS):
         raise ValueError(f"image size {height} x {width}")
     # CO3D's first release has no format: it knew only this one.
     ndc = (viewpoint or {}).get("intrinsics_format", "ndc_norm_image_bounds")
     if ndc not in NDC_FORMATS:
         raise ValueError(f"intrinsics_format {ndc!r} is none of {', '.join(NDC_FORMATS)}")
-    number = _typed(entry["frame_number"], int, "frame_number")
+    number = _require_type(entry["frame_number"], int, "frame_number")
     if abs(number) >= 2**63:
         raise ValueError(f"frame_number {number}")
     return FrameAnnotation(
-        sequence=_typed(entry["sequence_name"], str, "sequence_name"),
+        sequence=_require_type(entry["sequence_name"], str, "sequence_name"),
         number=number,
         image_path=_path(image["path"], file),
         size=(height, width),
@@ -143,7 +143,7 @@ def _depth(entry: Any, file: Path) -> DepthFile | None:
 def _sequence(entry: Any, file: Path) -> SequenceAnnotation:
     cloud = entry.get("point_cloud")
     return SequenceAnnotation(
-        name=_typed(entry["sequence_name"], str, "sequence_name"),
+        name=_require_type(entry["sequence_name"], str, "sequence_name"),
         viewpoint_quality=_optional_float(entry.get("viewpoint_quality_score")),
         point_cloud_path=_optional_path(cloud, "path", file),
         point_cloud_quality=_optional_float(cloud.get("quality_score")) if cloud else None,
@@ -152,7 +152,7 @@ def _sequence(entry: Any, file: Path) -> SequenceAnnotation:
 
 def _path(value: Any, file: Path) -> str:
     """The same file has the same path, however it is spelt."""
-    return posixpath.normpath(check_relative(_typed(value, str, "path"), file))
+    return posixpath.normpath(check_relative(_require_type(value, str, "path"), file))
 
 
 def _optional_path(entry: Any, key: str, file: Path) -> str | None:
@@ -164,7 +164,7 @@ def _optional_float(value: Any) -> float | None:
     return None if value is None else float(value)
 
 
-def _typed(value: Any, kind: type, what: str) -> Any:
+def _require_type(value: Any, kind: type, what: str) -> Any:
     if not isinstance(value, kind):
         raise TypeError(f"{what} is {value!r}, expected {kind.__name__}")
     if isinstance(value, str) and any("\ud800" <= letter <= "\udfff" for letter in value):

@@ -3,8 +3,7 @@
 import math
 import os
 from collections import defaultdict
-from collections.abc import Iterable
-from collections.abc import Sequence as ListOf
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import cast, overload
@@ -34,7 +33,7 @@ class _Cameras:
 
 
 @dataclass(frozen=True, eq=False)
-class Co3dFrames(ListOf[Frame]):
+class Co3dFrames(Sequence[Frame]):
     """Some frames of one sequence; each is made when it is asked for.
 
     Columns with one row per frame, about 350 bytes instead of the 7,000 of as many small objects.
@@ -85,7 +84,7 @@ class Co3dFrames(ListOf[Frame]):
         )
 
     @classmethod
-    def join(cls, parts: ListOf["Co3dFrames"]) -> "Co3dFrames":
+    def join(cls, parts: Sequence["Co3dFrames"]) -> "Co3dFrames":
         """All frames of the parts, by number."""
         columns = {
             name: np.concatenate([getattr(part, name) for part in parts]) for name in cls._columns()

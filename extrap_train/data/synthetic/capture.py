@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float
 
 from extrap_train.config import SyntheticConfig
-from extrap_train.data.sequences import Frame, Sequence
+from extrap_train.data.sequences import Frame, FrameSequence
 from extrap_train.data.synthetic.categories import build_scene
+from extrap_train.data.synthetic.parts import SyntheticScene
 from extrap_train.data.synthetic.render import render
-from extrap_train.data.synthetic.scene import SyntheticScene
 from extrap_train.geometry.orbits import looking_at
 from extrap_train.views import Camera, View
 
@@ -26,7 +26,7 @@ def walk_seed(category: str, index: int, seed: int) -> int:
     return zlib.crc32(f"{seed}/{category}/{index}".encode())
 
 
-def synthetic_sequence(category: str, index: int, options: SyntheticConfig) -> Sequence:
+def synthetic_sequence(category: str, index: int, options: SyntheticConfig) -> FrameSequence:
     """The walk around a scene that `data=synthetic` trains on or tests with, not yet rendered.
 
     Sequences 0 … `test_sequences` − 1 are for testing. Pictures are those on disk before their
@@ -39,7 +39,7 @@ def synthetic_sequence(category: str, index: int, options: SyntheticConfig) -> S
     for number in range(options.frames):
         name, camera = f"frame{number:06d}", cameras[number]
         frames.append(Frame(name, camera, True, True, _Renderer(scene, camera, name).load, ()))
-    return Sequence(category, sequence_name(index), tuple(frames))
+    return FrameSequence(category, sequence_name(index), tuple(frames))
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ from extrap_train.data.synthetic.material import (
     Tiles,
     Worn,
     linear_color,
-    varied,
+    vary_color,
 )
-from extrap_train.data.synthetic.scene import Part, placement
+from extrap_train.data.synthetic.parts import Part, placement
 from extrap_train.data.synthetic.shapes import flat_ground, lathe, rounded_box
 from extrap_train.data.synthetic.vectors import Real
 
@@ -29,21 +29,21 @@ def draw_seed(rng: np.random.Generator) -> int:
 
 def lawn(rng: np.random.Generator) -> Texture:
     """Grass with drier patches."""
-    green = varied(rng, ["#4f7a2f", "#5f8a3a", "#6d7f3a", "#3f6b35"])
+    green = vary_color(rng, ["#4f7a2f", "#5f8a3a", "#6d7f3a", "#3f6b35"])
     grass = Mottled(green * 0.45, green * 1.5, rng.uniform(9, 14), draw_seed(rng), 3, 0.9)
-    return Worn(grass, varied(rng, ["#8f8350", "#7a6a45"]), 0.25, 0.9, draw_seed(rng), 1e-3)
+    return Worn(grass, vary_color(rng, ["#8f8350", "#7a6a45"]), 0.25, 0.9, draw_seed(rng), 1e-3)
 
 
 def gravel(rng: np.random.Generator) -> Texture:
     """Bare earth, asphalt or gravel."""
-    tone = varied(rng, ["#8a7558", "#6f6f70", "#a39377", "#5d5a57"])
+    tone = vary_color(rng, ["#8a7558", "#6f6f70", "#a39377", "#5d5a57"])
     coarse = Mottled(tone * 0.6, tone * 1.35, rng.uniform(8, 14), draw_seed(rng), 3, 0.8)
     return Worn(coarse, tone * rng.uniform(0.4, 0.6), 0.3, 1.1, draw_seed(rng), 1e-3)
 
 
 def pavement(rng: np.random.Generator) -> Texture:
     """Slabs or setts with joints."""
-    tone = varied(rng, STONES)
+    tone = vary_color(rng, STONES)
     size = rng.uniform(0.35, 0.9)
     stone = Mottled(tone * 0.75, tone * 1.2, rng.uniform(3, 7), draw_seed(rng), 3, 0.8)
     return Tiles(
@@ -53,14 +53,14 @@ def pavement(rng: np.random.Generator) -> Texture:
 
 def bricks(rng: np.random.Generator) -> Texture:
     """Brickwork, for paths and walls."""
-    tone = varied(rng, ["#9a4f3a", "#b06a4a", "#a8805e", "#7d4338"])
+    tone = vary_color(rng, ["#9a4f3a", "#b06a4a", "#a8805e", "#7d4338"])
     clay = Mottled(tone * 0.7, tone * 1.25, 5.0, draw_seed(rng), 2, 0.7)
     return Tiles(clay, linear_color("#b8b0a4"), (0.46, 0.19), draw_seed(rng), 0.03, 0.5, 0.3)
 
 
 def floorboards(rng: np.random.Generator) -> Texture:
     """Planks with grain along X."""
-    tone = varied(rng, FLOOR_WOODS)
+    tone = vary_color(rng, FLOOR_WOODS)
     grain = Mottled(tone * 0.6, tone * 1.3, 7.0, draw_seed(rng), 3, 0.8, stretch=(0.12, 1.0, 1.0))
     size = (rng.uniform(1.5, 2.5), rng.uniform(0.2, 0.4))
     return Tiles(grain, tone * 0.25, size, draw_seed(rng), 0.02, 0.37, 0.3)
@@ -68,8 +68,8 @@ def floorboards(rng: np.random.Generator) -> Texture:
 
 def floor_tiles(rng: np.random.Generator) -> Texture:
     """Ceramic tiles, sometimes a chessboard."""
-    tone = varied(rng, ["#cfc8ba", "#b7c0bd", "#a8927a", "#d8d2c8"])
-    second = varied(rng, ["#4a4a4f", "#7c4a3a", "#48605a"]) if rng.random() < 0.5 else None
+    tone = vary_color(rng, ["#cfc8ba", "#b7c0bd", "#a8927a", "#d8d2c8"])
+    second = vary_color(rng, ["#4a4a4f", "#7c4a3a", "#48605a"]) if rng.random() < 0.5 else None
     inside = Mottled(tone * 0.8, tone, 2.5, draw_seed(rng), 3, 0.8)
     size = rng.uniform(0.4, 0.8)
     return Tiles(inside, tone * 0.4, (size, size), draw_seed(rng), 0.03, 0.0, 0.1, second)
@@ -77,15 +77,15 @@ def floor_tiles(rng: np.random.Generator) -> Texture:
 
 def carpet(rng: np.random.Generator) -> Texture:
     """A carpet or a table cloth."""
-    base = varied(rng, CLOTHS)
+    base = vary_color(rng, CLOTHS)
     if rng.random() < 0.5:
-        return Plaid(base, varied(rng, CLOTHS), varied(rng, CLOTHS), rng.uniform(0.3, 0.7))
+        return Plaid(base, vary_color(rng, CLOTHS), vary_color(rng, CLOTHS), rng.uniform(0.3, 0.7))
     return Mottled(base * 0.6, base * 1.35, rng.uniform(4, 9), draw_seed(rng), 3, 0.9)
 
 
 def table_wood(rng: np.random.Generator) -> Texture:
     """A polished board of one or several planks."""
-    tone = varied(rng, FLOOR_WOODS + WOODS[:2])
+    tone = vary_color(rng, FLOOR_WOODS + WOODS[:2])
     return Tiles(
         Mottled(tone * 0.6, tone * 1.25, 6.0, draw_seed(rng), 3, 0.9, stretch=(0.13, 1.0, 1.0)),
         tone * 0.35,

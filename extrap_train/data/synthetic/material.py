@@ -71,7 +71,7 @@ def linear_to_srgb(linear: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3
     return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-def varied(rng: np.random.Generator, codes: list[str], spread: Real = 0.12) -> Color:
+def vary_color(rng: np.random.Generator, codes: list[str], spread: Real = 0.12) -> Color:
     """One of the colours, a little lighter, darker or tinted."""
     color = linear_color(codes[rng.integers(len(codes))])
     tint = rng.normal(0, spread / 2, 3) + rng.normal(0, spread)

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Bool, Float
 
 from extrap_train.data.synthetic.material import linear_to_srgb
-from extrap_train.data.synthetic.scene import SyntheticScene
+from extrap_train.data.synthetic.parts import SyntheticScene
 from extrap_train.data.synthetic.shading import radiance
-from extrap_train.data.synthetic.vectors import rotated
+from extrap_train.data.synthetic.vectors import rotate
 from extrap_train.views import Camera, View
 
 _REACH = 1.5
@@ -60,7 +60,7 @@ def _rays(
     columns = (np.arange(camera.width * supersample) + 0.5) / supersample
     rows = (np.arange(camera.height * supersample) + 0.5) / supersample
     x, y = np.meshgrid((columns - k[0, 2]) / k[0, 0], (rows - k[1, 2]) / k[1, 1])
-    directions = rotated(np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3), cam_to_world[:3, :3])
+    directions = rotate(np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3), cam_to_world[:3, :3])
     origins = np.broadcast_to(cam_to_world[:3, 3], directions.shape)
     return np.ascontiguousarray(origins, np.float32), directions.astype(np.float32)
 

@@ -7,8 +7,8 @@ from jaxtyping import Float
 
 from extrap_train.data.synthetic.material import Surface
 from extrap_train.data.synthetic.noise import fractal_noise
-from extrap_train.data.synthetic.scene import Hits, Part, SyntheticScene
-from extrap_train.data.synthetic.vectors import dot, normalized, rotated
+from extrap_train.data.synthetic.parts import Hits, Part, SyntheticScene
+from extrap_train.data.synthetic.vectors import dot, normalize, rotate
 
 _SHADOW_OFFSET = np.float32(0.004)
 
@@ -56,7 +56,7 @@ def _shade(scene: SyntheticScene, part: Part, lit: _Lit) -> Float[np.ndarray, "n
     albedo = part.material.texture(surface)
     if part.material.glow == 1:
         return albedo
-    normals = _roughened(part, surface, lit.normals)
+    normals = _roughen(part, surface, lit.normals)
     to_sun = scene.light.to_sun
     cosine = np.maximum(dot(normals, to_sun), 0)
     facing = np.flatnonzero((cosine > 0) & (dot(lit.normals, to_sun) > 0))
@@ -78,8 +78,8 @@ def _arrive(
     pixel_angle: float,
 ) -> _Lit:
     attributes = scene.interpolate(hits)
-    to_eye = normalized(-directions)
-    normals = normalized(attributes[:, :3])
+    to_eye = normalize(-directions)
+    normals = normalize(attributes[:, :3])
     cosine = dot(normals, to_eye)
     normals *= np.copysign(np.float32(1), cosine)[:, None]  # thin sheets have two sides
     # Between the pixel's width across the view and its length along a grazing surface.
@@ -95,13 +95,13 @@ def _local_surface(part: Part, lit: _Lit) -> Surface:
     rotation = (part.part_to_world[:3, :3] / scale).astype(np.float32)
     shift = part.part_to_world[:3, 3].astype(np.float32)
     return Surface(
-        rotated(lit.points - shift, rotation.T) / np.float32(scale),
-        rotated(lit.normals, rotation.T),
+        rotate(lit.points - shift, rotation.T) / np.float32(scale),
+        rotate(lit.normals, rotation.T),
         lit.footprint / np.float32(scale),
     )
 
 
-def _roughened(
+def _roughen(
     part: Part, surface: Surface, normals: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3"]:
     """Normals tilted by fine noise: fur, cast iron, bark."""
@@ -113,7 +113,7 @@ def _roughened(
         for i in range(3)
     ]
     tilted = normals + material.roughness * np.stack(tilts, -1)
-    return normalized(tilted)
+    return normalize(tilted)
 
 
 def _highlight(
@@ -124,7 +124,7 @@ def _highlight(
     sunlit: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, "n 3"]:
     """Blinn-Phong highlight of the sun, and a faint mirror image of the sky at grazing angles."""
-    half = normalized(lit.to_eye + scene.light.to_sun)
+    half = normalize(lit.to_eye + scene.light.to_sun)
     glint = np.maximum(dot(half, normals), 0) ** np.float32(part.material.shininess) * sunlit
     grazing = 1 - np.clip(dot(lit.to_eye, normals), 0, 1)
     mirrored = np.float32(0.35) * grazing**4

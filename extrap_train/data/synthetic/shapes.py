@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Int
 
-from extrap_train.data.synthetic.vectors import Real, rotated
+from extrap_train.data.synthetic.vectors import Real, rotate
 
 _CREASE = np.cos(np.deg2rad(35.0))
 
@@ -180,17 +180,17 @@ def merge(meshes: list[Mesh]) -> Mesh:
     )
 
 
-def moved(mesh: Mesh, matrix: Float[np.ndarray, "4 4"]) -> Mesh:
+def move_mesh(mesh: Mesh, matrix: Float[np.ndarray, "4 4"]) -> Mesh:
     """The mesh under a rigid transform with an even scale."""
     scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
     return Mesh(
-        rotated(mesh.vertices, matrix[:3, :3]) + matrix[:3, 3],
+        rotate(mesh.vertices, matrix[:3, :3]) + matrix[:3, 3],
         mesh.faces,
-        rotated(mesh.normals, matrix[:3, :3] / scale),
+        rotate(mesh.normals, matrix[:3, :3] / scale),
     )
 
 
-def displaced(mesh: Mesh, offset: Float[np.ndarray, "v 3"]) -> Mesh:
+def displace(mesh: Mesh, offset: Float[np.ndarray, "v 3"]) -> Mesh:
     """The mesh with its vertices shifted, and its normals made anew."""
     vertices = mesh.vertices + offset
     return Mesh(vertices, mesh.faces, _vertex_normals(vertices, mesh.faces))

@@ -17,15 +17,15 @@ from extrap_train.data.synthetic.material import (
     Tiles,
     linear_color,
     mix,
-    varied,
+    vary_color,
 )
 from extrap_train.data.synthetic.noise import fractal_noise
-from extrap_train.data.synthetic.scene import Part, placement
+from extrap_train.data.synthetic.parts import Part, placement
 from extrap_train.data.synthetic.shapes import (
     Mesh,
     Point,
     capsule,
-    displaced,
+    displace,
     ellipsoid,
     lathe,
     rounded_box,
@@ -64,9 +64,9 @@ def outdoors(rng: np.random.Generator) -> list[Part]:
     makers = [ground.lawn, ground.gravel, ground.pavement, ground.bricks]
     texture = makers[rng.choice(4, p=[0.3, 0.2, 0.35, 0.15])](rng)
     sky = Sky(
-        varied(rng, ["#5f93cf", "#7fa9d6", "#9db4c8"]),
-        varied(rng, ["#cfdde8", "#dfe3e2", "#e9ddca"]),
-        varied(rng, ["#5d7358", "#6f7f86", "#7c7a63"]),
+        vary_color(rng, ["#5f93cf", "#7fa9d6", "#9db4c8"]),
+        vary_color(rng, ["#cfdde8", "#dfe3e2", "#e9ddca"]),
+        vary_color(rng, ["#5d7358", "#6f7f86", "#7c7a63"]),
         draw_seed(rng),
     )
     parts = [*ground.wide_ground(texture, 18.0), _dome(sky)]
@@ -136,7 +136,7 @@ def _room(
     rng: np.random.Generator, half: Float[np.ndarray, " 2"], floor: Real, height: Real
 ) -> list[Part]:
     """Four walls and a ceiling with pictures and windows."""
-    tone = varied(rng, ["#d8cfc0", "#b9c4c0", "#c7b299", "#a9b3c4", "#cdbfc3", "#9aa78f"])
+    tone = vary_color(rng, ["#d8cfc0", "#b9c4c0", "#c7b299", "#a9b3c4", "#cdbfc3", "#9aa78f"])
     wall: Texture
     match rng.integers(4):
         case 0:
@@ -175,9 +175,9 @@ def _hanging(rng: np.random.Generator, spot: Point, turn: Real) -> list[Part]:
         )
         material = Material(texture, glow=1)
     else:
-        low, high = varied(rng, _PAINTS), varied(rng, _PAINTS)
+        low, high = vary_color(rng, _PAINTS), vary_color(rng, _PAINTS)
         material = Material(Mottled(low, high, rng.uniform(0.8, 2.5), draw_seed(rng), 3, 2.0))
-    wood = Material(Plain(varied(rng, ground.WOODS)))
+    wood = Material(Plain(vary_color(rng, ground.WOODS)))
     return [
         Part(frame, wood, placement(spot, turn), False, False),
         Part(pane, material, placement(spot, turn), False, False),
@@ -190,18 +190,18 @@ def _bush(rng: np.random.Generator, spot: Point, turn: Real) -> list[Part]:
 
 
 def _foliage(rng: np.random.Generator, spot: Point, size: Real) -> Part:
-    green = varied(rng, ["#3f6b2f", "#56803a", "#6f8a3f", "#7f7a3a", "#9a5f3a"])
+    green = vary_color(rng, ["#3f6b2f", "#56803a", "#6f8a3f", "#7f7a3a", "#9a5f3a"])
     ball = ellipsoid((0.55, 0.5, 0.5), 20)
     flat = np.zeros(len(ball.vertices), np.float32)
     bumps = fractal_noise(ball.vertices.astype(np.float32), flat, 4.0, 2, draw_seed(rng))
-    mesh = displaced(ball, 0.25 * bumps[:, None] * ball.normals)
+    mesh = displace(ball, 0.25 * bumps[:, None] * ball.normals)
     texture = Mottled(green * 0.3, green * 1.5, 8.0, draw_seed(rng), 3, 1.1)
     return _scenery(mesh, Material(texture, roughness=0.6), spot, rng.uniform(0, 6), size)
 
 
 def _tree(rng: np.random.Generator, spot: Point, turn: Real) -> list[Part]:
     height = rng.uniform(2.0, 3.2)
-    bark = varied(rng, ["#5a4632", "#7a6a55", "#4a4038"])
+    bark = vary_color(rng, ["#5a4632", "#7a6a55", "#4a4038"])
     trunk = lathe(np.array([[0.22, 0], [0.14, 0.4], [0.11, height]]), 12)
     texture = Mottled(bark * 0.5, bark * 1.4, 7.0, draw_seed(rng), 3, stretch=(1, 1, 0.25))
     crown = (spot[0], spot[1], height + 0.5)
@@ -220,7 +220,7 @@ def _wall(rng: np.random.Generator, spot: Point, turn: Real) -> list[Part]:
 
 def _crate(rng: np.random.Generator, spot: Point, turn: Real, scale: Real = 1.0) -> list[Part]:
     size = rng.uniform(0.4, 1.0, 3) * scale
-    tone = varied(rng, _PAINTS)
+    tone = vary_color(rng, _PAINTS)
     inside = Mottled(tone * 0.7, tone * 1.2, 5.0, draw_seed(rng), 2, stretch=(1, 1, 0.3))
     texture = Tiles(inside, tone * 0.4, (0.9, rng.uniform(0.15, 0.5)), draw_seed(rng), 0.03)
     middle = (spot[0], spot[1], spot[2] + size[2] / 2)
@@ -239,15 +239,15 @@ def _post(rng: np.random.Generator, spot: Point, turn: Real) -> list[Part]:
             [0, height + radius],
         ]
     )
-    tone = varied(rng, _PAINTS)
-    texture = Tiles(Plain(tone), varied(rng, _PAINTS), (50.0, rng.uniform(0.4, 1.0)), 3, 0.15)
+    tone = vary_color(rng, _PAINTS)
+    texture = Tiles(Plain(tone), vary_color(rng, _PAINTS), (50.0, rng.uniform(0.4, 1.0)), 3, 0.15)
     return [_scenery(lathe(profile, 14), Material(texture, 0.3), spot, turn)]
 
 
 def _house(rng: np.random.Generator, spot: Point, turn: Real) -> list[Part]:
     size = (rng.uniform(3, 6), rng.uniform(2, 4), rng.uniform(2, 6))
-    tone = varied(rng, ["#c9bfae", "#b08a6a", "#a9adb0", "#d3c48f", "#9a6a5a"])
-    panes = Plain(varied(rng, ["#3a4a5a", "#55646e"]))
+    tone = vary_color(rng, ["#c9bfae", "#b08a6a", "#a9adb0", "#d3c48f", "#9a6a5a"])
+    panes = Plain(vary_color(rng, ["#3a4a5a", "#55646e"]))
     texture = Tiles(panes, tone, (rng.uniform(0.9, 1.4), rng.uniform(1.0, 1.5)), 5, 0.6, shades=0.4)
     middle = (spot[0], spot[1], size[2] / 2)
     return [_scenery(rounded_box(size), Material(texture), middle, turn)]
@@ -255,7 +255,7 @@ def _house(rng: np.random.Generator, spot: Point, turn: Real) -> list[Part]:
 
 def _cabinet(rng: np.random.Generator, spot: Point, turn: Real, scale: Real = 1.0) -> list[Part]:
     size = (rng.uniform(0.8, 2.0) * scale, 0.5 * scale, rng.uniform(0.5, 2.2) * scale)
-    tone = varied(rng, ground.WOODS + _PAINTS[4:6])
+    tone = vary_color(rng, ground.WOODS + _PAINTS[4:6])
     grain = Mottled(tone * 0.65, tone * 1.25, 4.0, draw_seed(rng), 2, stretch=(0.2, 0.2, 1))
     cells = (size[0] / rng.integers(1, 4), size[2] / rng.integers(1, 5))
     texture = Tiles(grain, tone * 0.3, cells, draw_seed(rng), 0.05, shades=0.2)
@@ -265,17 +265,17 @@ def _cabinet(rng: np.random.Generator, spot: Point, turn: Real, scale: Real = 1.
 
 def _lamp(rng: np.random.Generator, spot: Point, turn: Real, scale: Real = 1.0) -> list[Part]:
     height = rng.uniform(1.6, 2.4) * scale
-    metal = Material(Plain(varied(rng, ["#3a3a3c", "#a08a5a", "#c8c8c8"])), 0.4)
+    metal = Material(Plain(vary_color(rng, ["#3a3a3c", "#a08a5a", "#c8c8c8"])), 0.4)
     pole = lathe(np.array([[0.3, 0], [0.3, 0.05], [0.04, 0.07], [0.04, height]]), 12)
     shade = lathe(np.array([[0.38, height - 0.3], [0.22, height + 0.25]]), 20)
-    cloth = Material(Plain(varied(rng, ["#e8d9b0", "#d9a45a", "#dfe0da", "#c77f6a"])), glow=1)
+    cloth = Material(Plain(vary_color(rng, ["#e8d9b0", "#d9a45a", "#dfe0da", "#c77f6a"])), glow=1)
     return [_scenery(pole, metal, spot, turn), _scenery(shade, cloth, spot, turn)]
 
 
 def _plant(rng: np.random.Generator, spot: Point, turn: Real, scale: Real = 1.0) -> list[Part]:
     size = rng.uniform(0.35, 0.6) * scale
     pot = lathe(np.array([[0.3, 0], [0.45, 0.8], [0.38, 0.8], [0.36, 0.7], [0, 0.7]]) * size, 18)
-    dark, pale = (varied(rng, ["#a85f40", "#d8d2c4", "#4f5f6f"]) for _ in range(2))
+    dark, pale = (vary_color(rng, ["#a85f40", "#d8d2c4", "#4f5f6f"]) for _ in range(2))
     clay = Material(Mottled(dark * 0.7, pale * 1.1, 4.0, 3))
     leaves = _foliage(rng, (spot[0], spot[1], spot[2] + 1.3 * size), 1.6 * size)
     return [_scenery(pot, clay, spot, turn), leaves]
@@ -283,8 +283,10 @@ def _plant(rng: np.random.Generator, spot: Point, turn: Real, scale: Real = 1.0)
 
 def _small_thing(rng: np.random.Generator, spot: Point, turn: Real) -> list[Part]:
     """A box, a bottle or a ball near the edge of a table."""
-    tone = varied(rng, _PAINTS)
-    material = Material(Mottled(tone * 0.7, varied(rng, _PAINTS), 3.0, draw_seed(rng), 2, 1.5), 0.2)
+    tone = vary_color(rng, _PAINTS)
+    material = Material(
+        Mottled(tone * 0.7, vary_color(rng, _PAINTS), 3.0, draw_seed(rng), 2, 1.5), 0.2
+    )
     match rng.integers(3):
         case 0:
             size = tuple(rng.uniform(0.15, 0.4, 3))

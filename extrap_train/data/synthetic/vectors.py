@@ -12,7 +12,7 @@ Real = int | float
 
 @compiled()
 @no_type_check
-def _rotated(vectors, matrix):  # noqa: ANN001, ANN202
+def _rotate(vectors, matrix):  # noqa: ANN001, ANN202
     out = np.empty_like(vectors)
     for n in range(len(vectors)):
         x, y, z = vectors[n, 0], vectors[n, 1], vectors[n, 2]
@@ -32,7 +32,7 @@ def _dot(a, b):  # noqa: ANN001, ANN202
 
 @compiled()
 @no_type_check
-def _normalized(vectors):  # noqa: ANN001, ANN202
+def _normalize(vectors):  # noqa: ANN001, ANN202
     out = np.empty_like(vectors)
     for n in range(len(vectors)):
         x, y, z = vectors[n, 0], vectors[n, 1], vectors[n, 2]
@@ -41,11 +41,11 @@ def _normalized(vectors):  # noqa: ANN001, ANN202
     return out
 
 
-def rotated(
+def rotate(
     vectors: Float[np.ndarray, "n 3"], matrix: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, "n 3"]:
     """`matrix` applied to each vector, in the vectors' precision."""
-    return _rotated(np.ascontiguousarray(vectors), np.ascontiguousarray(matrix, vectors.dtype))
+    return _rotate(np.ascontiguousarray(vectors), np.ascontiguousarray(matrix, vectors.dtype))
 
 
 def dot(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, " n"]:
@@ -53,6 +53,6 @@ def dot(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "*n 3"]) -> Float[np.n
     return _dot(np.ascontiguousarray(a), np.broadcast_to(b, a.shape).astype(a.dtype, copy=False))
 
 
-def normalized(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def normalize(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Each vector at unit length; a zero vector stays zero."""
-    return _normalized(np.ascontiguousarray(vectors))
+    return _normalize(np.ascontiguousarray(vectors))

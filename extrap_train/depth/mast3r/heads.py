@@ -43,7 +43,7 @@ class Fusion(nn.Module):
         """The coarsest level has no `level` beside it."""
         if level is not None:
             coarse = coarse + self.resConfUnit1(level)
-        return self.out_conv(_doubled(self.resConfUnit2(coarse)))
+        return self.out_conv(_upsample(self.resConfUnit2(coarse)))
 
 
 class Pyramid(nn.Module):
@@ -141,12 +141,12 @@ class LinearPointHead(nn.Module):
 
     def forward(self, layers: Sequence[Tokens], grid: tuple[int, int]) -> Float[Tensor, "b 4 h w"]:
         """From the decoder's last tokens alone."""
-        return _unpatched(self.proj(layers[-1]), grid, self.patch)
+        return _unpatch(self.proj(layers[-1]), grid, self.patch)
 
 
-def _unpatched(tokens: Tokens, grid: tuple[int, int], patch: int) -> Float[Tensor, "b c h w"]:
+def _unpatch(tokens: Tokens, grid: tuple[int, int], patch: int) -> Float[Tensor, "b c h w"]:
     return functional.pixel_shuffle(tokens.mT.unflatten(-1, grid), patch)
 
 
-def _doubled(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h2 w2"]:
+def _upsample(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h2 w2"]:
     return functional.interpolate(x, scale_factor=2, mode="bilinear", align_corners=True)

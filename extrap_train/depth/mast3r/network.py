@@ -105,8 +105,8 @@ class PointMapNetwork(nn.Module):
             twos.append(two)
         ones[-1], twos[-1] = self.dec_norm(one), self.dec_norm(two)
         return (
-            _activated(self.downstream_head1(ones, first.grid)),
-            _activated(self.downstream_head2(twos, second.grid)),
+            _activate(self.downstream_head1(ones, first.grid)),
+            _activate(self.downstream_head2(twos, second.grid)),
         )
 
     def forward(
@@ -122,7 +122,7 @@ def _head(a: Architecture) -> nn.Module:
     return DensePointHead(a.encoder_width, a.decoder_width, a.patch, a.descriptor_width)
 
 
-def _activated(raw: Float[Tensor, "b 4 h w"]) -> Prediction:
+def _activate(raw: Float[Tensor, "b 4 h w"]) -> Prediction:
     """Points leave the origin exponentially; the confidence is an exponential, too."""
     values = raw.permute(0, 2, 3, 1)
     points, confidence = values[..., : POINT_CHANNELS - 1], 1 + values[..., -1].exp()

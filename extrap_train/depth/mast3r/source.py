@@ -7,10 +7,10 @@ import torch
 
 from extrap_train.config import Mast3rConfig
 from extrap_train.depth import DepthMap, PointMaps, point_maps_of
-from extrap_train.depth.fusion import fused
+from extrap_train.depth.fusion import fuse_depth_maps
+from extrap_train.depth.mast3r.known_cameras import posed_depths
 from extrap_train.depth.mast3r.network import Encoding, PointMapNetwork
-from extrap_train.depth.mast3r.posed import posed_depths
-from extrap_train.depth.mast3r.preparation import Fit, fit, network_input
+from extrap_train.depth.mast3r.network_input import Fit, fit, network_input
 from extrap_train.depth.neighbours import WIDEST_RAD, neighbours_of
 from extrap_train.errors import InputError
 from extrap_train.views import Camera, View, combine
@@ -68,7 +68,7 @@ class Mast3rDepth:
         """
         views = [view, *neighbours]
         pairs = {(0, other) for other in self._neighbours(views)[0]}
-        found = self._fused(views, pairs, wanted={0})
+        found = self._fuse_pairs(views, pairs, wanted={0})
         if not found:
             raise InputError(
                 f"{view.name or 'a view'}: no other view shows enough of the same from another "
@@ -83,7 +83,7 @@ class Mast3rDepth:
             for i, others in enumerate(self._neighbours(views))
             for j in others
         }
-        found = self._fused(views, pairs, wanted=set(range(len(views))))
+        found = self._fuse_pairs(views, pairs, wanted=set(range(len(views))))
         return [
             found[i] if i in found else DepthMap(*torch.zeros_like(view.image[:2]))
             for i, view in enumerate(views)
@@ -92,7 +92,7 @@ class Mast3rDepth:
     def _neighbours(self, views: Sequence[View]) -> list[list[int]]:
         return neighbours_of(views, self.config.neighbours, WIDEST_RAD)
 
-    def _fused(
+    def _fuse_pairs(
         self, views: Sequence[View], pairs: set[tuple[int, int]], wanted: set[int]
     ) -> dict[int, DepthMap]:
         """Each wanted view's depth from all that its pairs say, if they say any.
@@ -116,7 +116,7 @@ class Mast3rDepth:
                     said = estimates.pop(view)
                     del prepared[view]
                     if said:
-                        depths[view] = fused(said)
+                        depths[view] = fuse_depth_maps(said)
         return depths
 
     @torch.no_grad()

@@ -35,8 +35,8 @@ def warp_references(
 
     `cameras` is batched `b k` and `query` `b`; the query's image size may differ from the
     references'. Depth 0 (or not finite) is unknown, and `valid` False leaves a reference out.
-    `flows` moves each reference's points in the query image before they are drawn (`geometry.flow`,
-    METHOD §6): colours, coordinates, depth and mask go together, and nothing is resampled twice.
+    `flows` (`geometry.spline_flow`) moves each reference's points in the query image before they
+    are drawn: colours, coordinates, depth and mask move together, and nothing is resampled twice.
     """
     depths = torch.where(valid[..., None, None], depths, 0)
     if needs_torch(images, depths):

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from extrap_train.geometry.warp.projection import LEAST_DEPTH_RATIO, project_pixels, subdivide
+from extrap_train.geometry.warp.query_projection import LEAST_DEPTH_RATIO, project_pixels, subdivide
 from extrap_train.geometry.warp.splat import ScreenPoints
 from extrap_train.geometry.warp.surface import Surface
 from extrap_train.views import Camera

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from extrap_train.geometry.cameras import pixel_grid
 from extrap_train.geometry.encoding import coordinate_grid
-from extrap_train.geometry.flow import flow_at_pixels
+from extrap_train.geometry.spline_flow import flow_at_pixels
 from extrap_train.geometry.warp.occlusion import is_occluded
-from extrap_train.geometry.warp.projection import (
+from extrap_train.geometry.warp.query_projection import (
     LEAST_DEPTH_RATIO,
     project_pixels,
     reference_to_query_pixels,

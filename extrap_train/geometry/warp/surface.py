@@ -127,8 +127,8 @@ def _sides(
     rises, falls = jump & (slope > 0), jump & (slope < 0)
     return _Sides(
         slopes=(
-            torch.where(before, to_before, _continued(to_after, after, 1)),
-            torch.where(after, to_after, _continued(to_before, before, -1)),
+            torch.where(before, to_before, _extend_slope(to_after, after, 1)),
+            torch.where(after, to_after, _extend_slope(to_before, before, -1)),
         ),
         connected=(before, after),
         ends=(functional.pad(rises, (1, 0)), functional.pad(falls, (0, 1))),
@@ -136,7 +136,7 @@ def _sides(
     )
 
 
-def _continued(
+def _extend_slope(
     slope: Float[Tensor, "*b h w"], connected: Bool[Tensor, "*b h w"], inwards: int
 ) -> Float[Tensor, "*b h w"]:
     """The slope beyond the end of a surface: as it is just inside, changing on as it did there

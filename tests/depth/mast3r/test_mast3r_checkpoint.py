@@ -8,8 +8,8 @@ from safetensors.torch import save_file
 from tiny import EXPRESSION, TINY, plain_state, write_checkpoint
 
 from extrap_train.config import Mast3rConfig
-from extrap_train.depth.build import depth_source
 from extrap_train.depth.mast3r.checkpoint import read_network
+from extrap_train.depth.sources import depth_source
 from extrap_train.errors import InputError
 
 SMALL = replace(TINY, encoder_depth=1, decoder_depth=2)

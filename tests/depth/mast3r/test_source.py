@@ -9,10 +9,10 @@ from traced_scenes import SCENES, orbit_camera, render
 
 from extrap_train.config import Mast3rConfig
 from extrap_train.depth import DepthSource
-from extrap_train.depth.build import depth_source
-from extrap_train.depth.fusion import fused
-from extrap_train.depth.mast3r.preparation import fit
+from extrap_train.depth.fusion import fuse_depth_maps
+from extrap_train.depth.mast3r.network_input import fit
 from extrap_train.depth.mast3r.source import Mast3rDepth
+from extrap_train.depth.sources import depth_source
 from extrap_train.errors import InputError
 from extrap_train.geometry.cameras import transform, unproject_to_world
 
@@ -65,7 +65,7 @@ def test_a_view_is_forgotten_with_its_last_pair_and_the_depth_is_that_of_all_pai
     monkeypatch.setattr(Mast3rDepth, "_prepare", prepared)
     monkeypatch.setattr(Mast3rDepth, "_pair", kept)
     for i, found in enumerate(source.depth_maps(views)):
-        expected = fused(everything[i])
+        expected = fuse_depth_maps(everything[i])
         assert torch.equal(found.depth, expected.depth)
         assert torch.equal(found.confidence, expected.confidence)
     assert source.network.encoded == len(views)

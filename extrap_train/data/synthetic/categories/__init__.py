@@ -11,8 +11,8 @@ import numpy as np
 
 from extrap_train.data.synthetic.categories import apple, book, chair, cup, hydrant, teddybear
 from extrap_train.data.synthetic.light import draw_light
-from extrap_train.data.synthetic.scene import Part, SyntheticScene, placement
-from extrap_train.data.synthetic.shapes import moved
+from extrap_train.data.synthetic.parts import Part, SyntheticScene, placement
+from extrap_train.data.synthetic.shapes import move_mesh
 from extrap_train.data.synthetic.surroundings import indoors, on_table, outdoors
 from extrap_train.errors import InputError
 
@@ -42,10 +42,10 @@ def build_scene(category: str, index: int, seed: int) -> SyntheticScene:
             f"no synthetic category '{category}'; there are {', '.join(sorted(_OBJECTS))}"
         )
     rng = np.random.default_rng([seed, zlib.crc32(category.encode()), index])
-    thing = _fitted(_OBJECTS[category](rng), turn_rad=rng.uniform(0, 2 * np.pi))
+    thing = _fit_to_ground(_OBJECTS[category](rng), turn_rad=rng.uniform(0, 2 * np.pi))
     place = int(rng.choice(3, p=_PLACES[category]))
     around = (outdoors, indoors, on_table)[place](rng)
-    corners = np.concatenate([moved(p.mesh, p.part_to_world).vertices for p in thing])
+    corners = np.concatenate([move_mesh(p.mesh, p.part_to_world).vertices for p in thing])
     low, high = corners.min(0), corners.max(0)
     middle = (low + high) / 2
     return SyntheticScene(
@@ -57,15 +57,15 @@ def build_scene(category: str, index: int, seed: int) -> SyntheticScene:
     )
 
 
-def _fitted(parts: list[Part], turn_rad: float) -> list[Part]:
+def _fit_to_ground(parts: list[Part], turn_rad: float) -> list[Part]:
     """The object scaled to a largest extent of 1, turned, and set on the ground at the origin."""
-    turned = [_after(placement(turn_rad=turn_rad), part) for part in parts]
-    corners = np.concatenate([moved(p.mesh, p.part_to_world).vertices for p in turned])
+    turned = [_transform_part(placement(turn_rad=turn_rad), part) for part in parts]
+    corners = np.concatenate([move_mesh(p.mesh, p.part_to_world).vertices for p in turned])
     low, high = corners.min(0), corners.max(0)
     scale = 1 / (high - low).max()
     shift = -scale * np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
-    return [_after(placement(shift, scale=scale), part) for part in turned]
+    return [_transform_part(placement(shift, scale=scale), part) for part in turned]
 
 
-def _after(transform: np.ndarray, part: Part) -> Part:
+def _transform_part(transform: np.ndarray, part: Part) -> Part:
     return replace(part, part_to_world=transform @ part.part_to_world)

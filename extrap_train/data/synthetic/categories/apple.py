@@ -13,11 +13,11 @@ from extrap_train.data.synthetic.material import (
     Surface,
     linear_color,
     mix,
-    varied,
+    vary_color,
 )
 from extrap_train.data.synthetic.noise import fractal_noise
-from extrap_train.data.synthetic.scene import Part, placement
-from extrap_train.data.synthetic.shapes import Mesh, displaced, lathe, sheet, sweep
+from extrap_train.data.synthetic.parts import Part, placement
+from extrap_train.data.synthetic.shapes import Mesh, displace, lathe, sheet, sweep
 
 
 @dataclass(frozen=True)
@@ -71,11 +71,11 @@ def build(rng: np.random.Generator) -> list[Part]:
     lean = rng.uniform(-0.12, 0.12, 2)
     length = rng.uniform(0.2, 0.36)
     path = [[*(lean * t * t), top + 0.02 + length * t] for t in np.linspace(0, 1, 6)]
-    bark = varied(rng, ["#5a4027", "#6e5a34", "#46351f"])
+    bark = vary_color(rng, ["#5a4027", "#6e5a34", "#46351f"])
     stem = sweep(np.array(path), np.linspace(0.018, 0.028, 6), 8)
     parts.append(Part(stem, Material(Mottled(bark * 0.6, bark * 1.4, 12.0, draw_seed(rng))), pose))
     if rng.random() < 0.5:
-        green = varied(rng, ["#4f7f2f", "#6f9a3f", "#3f6a35"])
+        green = vary_color(rng, ["#4f7f2f", "#6f9a3f", "#3f6a35"])
         leaf = Material(Mottled(green * 0.7, green * 1.3, 9.0, draw_seed(rng)), 0.25)
         parts.append(Part(_leaf(rng, np.array(path[3])), leaf, pose))
     return parts
@@ -86,7 +86,7 @@ def _variety(rng: np.random.Generator) -> tuple[Color, Color]:
     bases = [["#d8b84a", "#d9a441"], ["#8fae3a", "#a5b84c"], ["#b3302a", "#8f1f24"], ["#cfc25a"]]
     blushes = [["#b3272a", "#c8432f"], ["#c2a23f", "#a8523a"], ["#5f1220", "#d2603a"], ["#d0703a"]]
     kind = rng.integers(len(bases))
-    return varied(rng, bases[kind]), varied(rng, blushes[kind])
+    return vary_color(rng, bases[kind]), vary_color(rng, blushes[kind])
 
 
 def _body(rng: np.random.Generator) -> tuple[Mesh, float]:
@@ -102,7 +102,7 @@ def _body(rng: np.random.Generator) -> tuple[Mesh, float]:
     lobes = np.cos(5 * np.arctan2(y, x) + rng.uniform(0, 6)) * rng.uniform(0, 0.05)
     swell = lobes * (0.3 - z) + 0.06 * rng.normal() * x + 0.05 * rng.normal() * y
     offset = np.stack([x * swell, y * swell, np.zeros_like(z)], -1)
-    return displaced(smooth, offset), float(height[-1])
+    return displace(smooth, offset), float(height[-1])
 
 
 def _leaf(rng: np.random.Generator, root: Float[np.ndarray, " 3"]) -> Mesh:

@@ -6,8 +6,8 @@ import numpy as np
 
 from extrap_train.data.synthetic.ground import draw_seed
 from extrap_train.data.synthetic.lettering import Cover, Pages, Spine
-from extrap_train.data.synthetic.material import Material, varied
-from extrap_train.data.synthetic.scene import Part, placement
+from extrap_train.data.synthetic.material import Material, vary_color
+from extrap_train.data.synthetic.parts import Part, placement
 from extrap_train.data.synthetic.shapes import rounded_box
 from extrap_train.data.synthetic.vectors import Real
 
@@ -57,14 +57,14 @@ def _binding(rng: np.random.Generator, scale: Real) -> _Binding:
     height = scale
     width = height * rng.uniform(0.64, 0.85)
     thickness = rng.uniform(0.14, 0.28) * scale
-    ground, ink, second = (varied(rng, [_CLOTHS[i]], 0.08) for i in rng.permutation(9)[:3])
+    ground, ink, second = (vary_color(rng, [_CLOTHS[i]], 0.08) for i in rng.permutation(9)[:3])
     gloss = rng.uniform(0.0, 0.35)
     cover = Cover(
         ground, ink, second, (width, height), int(rng.integers(4)),
         float(rng.choice([-0.28, 0.28])), bool(rng.random() < 0.5), draw_seed(rng),
     )  # fmt: skip
     spine = Spine(ground if rng.random() < 0.7 else second, ink, height, draw_seed(rng))
-    paper = Pages(varied(rng, ["#efe8d6", "#e3d6b8", "#f4f1ea"], 0.05))
+    paper = Pages(vary_color(rng, ["#efe8d6", "#e3d6b8", "#f4f1ea"], 0.05))
     return _Binding(
         width, height, thickness, Material(cover, gloss), Material(spine, gloss), Material(paper)
     )

@@ -5,8 +5,8 @@ from collections.abc import Callable
 import numpy as np
 
 from extrap_train.data.synthetic.ground import CLOTHS, WOODS, draw_seed
-from extrap_train.data.synthetic.material import Material, Mottled, Plaid, Plain, Wood, varied
-from extrap_train.data.synthetic.scene import Part, placement
+from extrap_train.data.synthetic.material import Material, Mottled, Plaid, Plain, Wood, vary_color
+from extrap_train.data.synthetic.parts import Part, placement
 from extrap_train.data.synthetic.shapes import (
     Mesh,
     capsule,
@@ -43,17 +43,17 @@ def build(rng: np.random.Generator) -> list[Part]:
 
 def _frame_material(rng: np.random.Generator) -> Material:
     if rng.random() < 0.6:
-        tone = varied(rng, WOODS)
+        tone = vary_color(rng, WOODS)
         return Material(Wood(tone * 0.5, tone * 1.2, draw_seed(rng)), 0.25, 30)
-    tone = varied(rng, _PAINTS)
+    tone = vary_color(rng, _PAINTS)
     return Material(Mottled(tone * 0.85, tone * 1.05, 4.0, draw_seed(rng)), 0.35, 40)
 
 
 def _cloth(rng: np.random.Generator) -> Material:
-    base = varied(rng, CLOTHS)
+    base = vary_color(rng, CLOTHS)
     if rng.random() < 0.5:
         period = rng.uniform(0.08, 0.2)
-        return Material(Plaid(base, varied(rng, CLOTHS), varied(rng, CLOTHS), period))
+        return Material(Plaid(base, vary_color(rng, CLOTHS), vary_color(rng, CLOTHS), period))
     return Material(Mottled(base * 0.6, base * 1.3, rng.uniform(10, 22), draw_seed(rng)))
 
 
@@ -94,7 +94,7 @@ def _legs(rng: np.random.Generator, size: tuple[Real, Real, Real], frame: Materi
 
 def _pedestal(rng: np.random.Generator, seat: Real, width: Real) -> list[Part]:
     """A column on a round foot or on five spokes with castors."""
-    metal = Material(Plain(varied(rng, ["#8f9296", "#2c2c30", "#c9c9c6"])), 0.6, 50)
+    metal = Material(Plain(vary_color(rng, ["#8f9296", "#2c2c30", "#c9c9c6"])), 0.6, 50)
     column = lathe(np.array([[0.035, 0.05], [0.035, 0.2], [0.025, 0.2], [0.025, seat]]), 16)
     if rng.random() < 0.4:
         foot = [[0, 0], [width * 0.5, 0], [width * 0.5, 0.02], [0.05, 0.06], [0, 0.06]]

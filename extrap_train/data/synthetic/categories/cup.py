@@ -5,8 +5,8 @@ from jaxtyping import Float
 
 from extrap_train.data.synthetic.glaze import PATTERNS, Glaze
 from extrap_train.data.synthetic.ground import draw_seed
-from extrap_train.data.synthetic.material import Material, Mottled, Plain, linear_color, varied
-from extrap_train.data.synthetic.scene import Part, placement
+from extrap_train.data.synthetic.material import Material, Mottled, Plain, linear_color, vary_color
+from extrap_train.data.synthetic.parts import Part, placement
 from extrap_train.data.synthetic.shapes import Mesh, lathe, sweep
 from extrap_train.data.synthetic.vectors import Real
 
@@ -20,7 +20,7 @@ def build(rng: np.random.Generator) -> list[Part]:
     foot = rim * rng.uniform(0.6, 1.02)
     belly = rng.uniform(-0.05, 0.12) * rim
     glaze, ink, second = rng.permutation(len(_GLAZES))[:3]
-    colors = [varied(rng, [_GLAZES[i]], 0.08) for i in (glaze, ink, second)]
+    colors = [vary_color(rng, [_GLAZES[i]], 0.08) for i in (glaze, ink, second)]
     low, high = np.sort(rng.uniform(0.15, 0.9, 2)) if rng.random() < 0.3 else (0.18, 0.82)
     pattern = PATTERNS[rng.integers(len(PATTERNS))]
     outside = Glaze(
@@ -95,7 +95,7 @@ def _drink(
 ) -> Part:
     level = height * rng.uniform(0.7, 0.9)
     radius = np.interp(level, profile[:, 1], profile[:, 0]) - wall * 0.8
-    color = varied(rng, ["#3a2012", "#7a4a22", "#a8702f", "#cdbb9c"])
+    color = vary_color(rng, ["#3a2012", "#7a4a22", "#a8702f", "#cdbb9c"])
     disc = lathe(np.array([[radius, level], [0, level]]), 32)
     return Part(disc, Material(Mottled(color * 0.8, color * 1.2, 5.0, draw_seed(rng)), 0.8, 120))
 

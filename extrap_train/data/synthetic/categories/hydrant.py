@@ -9,10 +9,10 @@ from extrap_train.data.synthetic.material import (
     Mottled,
     Worn,
     linear_color,
-    varied,
+    vary_color,
 )
-from extrap_train.data.synthetic.scene import Part, placement
-from extrap_train.data.synthetic.shapes import Mesh, lathe, merge, moved, sweep
+from extrap_train.data.synthetic.parts import Part, placement
+from extrap_train.data.synthetic.shapes import Mesh, lathe, merge, move_mesh, sweep
 from extrap_train.data.synthetic.vectors import Real
 
 _PAINTS = ["#c2261f", "#d9b21f", "#2f5fa8", "#b4b8bb", "#dedcd2", "#3f7f4a", "#d9701f"]
@@ -22,8 +22,8 @@ def build(rng: np.random.Generator) -> list[Part]:
     """One hydrant of height 1."""
     body, cap = rng.permutation(len(_PAINTS))[:2]
     cap = body if rng.random() < 0.25 else cap
-    iron = _paint(rng, varied(rng, [_PAINTS[body]], 0.08))
-    contrast = _paint(rng, varied(rng, [_PAINTS[cap]], 0.08))
+    iron = _paint(rng, vary_color(rng, [_PAINTS[body]], 0.08))
+    contrast = _paint(rng, vary_color(rng, [_PAINTS[cap]], 0.08))
     radius, shoulder = rng.uniform(0.13, 0.18), rng.uniform(0.6, 0.7)
     nozzle_height = shoulder - rng.uniform(0.1, 0.17)
     parts = [
@@ -40,7 +40,7 @@ def build(rng: np.random.Generator) -> list[Part]:
         parts.append(_chain(rng, radius, nozzle_height))
     if rng.random() < 0.35:
         ring = np.array([[1.0, 0.0], [1.0, 1.0]]) * [radius + 0.004, rng.uniform(0.05, 0.1)]
-        dark, pale = (varied(rng, ["#e8e6dc", "#1f1f22"]) for _ in range(2))
+        dark, pale = (vary_color(rng, ["#e8e6dc", "#1f1f22"]) for _ in range(2))
         band = Material(Mottled(dark * 0.85, pale, 8.0, 1))
         parts.append(Part(lathe(ring, 28), band, placement((0, 0, rng.uniform(0.2, 0.32)))))
     return parts
@@ -49,7 +49,7 @@ def build(rng: np.random.Generator) -> list[Part]:
 def _paint(rng: np.random.Generator, color: Color) -> Material:
     """Painted cast iron: chips of rust, dirt near the ground."""
     coat = Mottled(color * 0.8, color * 1.08, 6.0, draw_seed(rng), 3)
-    rust = varied(rng, ["#6b3f26", "#4a3a30", "#7a5a3a"])
+    rust = vary_color(rng, ["#6b3f26", "#4a3a30", "#7a5a3a"])
     worn = Worn(coat, rust, rng.uniform(0.1, 0.6), rng.uniform(5, 9), draw_seed(rng), 0.18)
     return Material(worn, rng.uniform(0.1, 0.5), rng.uniform(15, 50), 0.12, 30.0)
 
@@ -74,7 +74,7 @@ def _bolts(rng: np.random.Generator, radius: Real) -> Mesh:
     turns = np.arange(count) * 2 * np.pi / count
     spots = [(float(np.cos(t)), float(np.sin(t))) for t in turns]
     far = radius + 0.045
-    return merge([moved(bolt, placement((far * x, far * y, 0.0))) for x, y in spots])
+    return merge([move_mesh(bolt, placement((far * x, far * y, 0.0))) for x, y in spots])
 
 
 def _bonnet(rng: np.random.Generator, radius: Real, shoulder: Real) -> Mesh:

@@ -10,10 +10,10 @@ from extrap_train.data.synthetic.material import (
     Plaid,
     Plain,
     linear_color,
-    varied,
+    vary_color,
 )
-from extrap_train.data.synthetic.scene import Part, placement
-from extrap_train.data.synthetic.shapes import capsule, ellipsoid, merge, moved, sweep, xyz
+from extrap_train.data.synthetic.parts import Part, placement
+from extrap_train.data.synthetic.shapes import capsule, ellipsoid, merge, move_mesh, sweep, xyz
 from extrap_train.data.synthetic.vectors import Real
 
 _FURS = ["#8a5a32", "#b98a55", "#d9c49a", "#5c3a24", "#8f8a86", "#e3dccf", "#c98f9a", "#a8713f"]
@@ -22,9 +22,9 @@ _PADS = ["#d9c49a", "#f0e6d2", "#c9a070", "#e8cfc0", "#5a4030"]
 
 def build(rng: np.random.Generator) -> list[Part]:
     """One bear that sits and looks along −Y."""
-    fur_color = varied(rng, _FURS)
-    fur, pad = _fur(rng, fur_color), _fur(rng, varied(rng, _PADS))
-    limb = _fur(rng, varied(rng, _FURS)) if rng.random() < 0.2 else fur
+    fur_color = vary_color(rng, _FURS)
+    fur, pad = _fur(rng, fur_color), _fur(rng, vary_color(rng, _PADS))
+    limb = _fur(rng, vary_color(rng, _FURS)) if rng.random() < 0.2 else fur
     width, depth, height = rng.uniform(0.2, 0.27), rng.uniform(0.17, 0.22), rng.uniform(0.24, 0.3)
     belly = placement((0, 0, height))
     parts = [Part(ellipsoid((width, depth, height), 26, 0.92), fur, belly)]
@@ -97,7 +97,7 @@ def _limbs(
 def _shirt(rng: np.random.Generator, body: tuple[Real, Real, Real]) -> Part:
     """A knitted pullover over the upper body."""
     width, depth, height = (x * 1.05 for x in body)
-    base, warp, weft = (varied(rng, CLOTHS) for _ in range(3))
+    base, warp, weft = (vary_color(rng, CLOTHS) for _ in range(3))
     cloth = Plaid(base, warp, weft, rng.uniform(0.08, 0.16))
     shell = ellipsoid((width, depth, height * 0.72), 26, 0.9)
     return Part(shell, Material(cloth), placement((0, 0, body[2] * 1.2)))
@@ -107,11 +107,11 @@ def _bow(rng: np.random.Generator, at: tuple[Real, Real, Real]) -> Part:
     """A ribbon tied under the chin."""
     size = rng.uniform(0.07, 0.11)
     loop = ellipsoid((size, size * 0.45, size * 0.62), 14)
-    loops = [moved(loop, placement((side * size * 1.05, 0, 0))) for side in (-1, 1)]
+    loops = [move_mesh(loop, placement((side * size * 1.05, 0, 0))) for side in (-1, 1)]
     knot = ellipsoid((size * 0.35,) * 3, 12)
     tails = [
         sweep(np.array([[0, 0, 0], [x * 0.6, -0.02, -size], [x, -0.02, -size * 1.7]]), 0.02, 6)
         for x in (-size, size)
     ]
-    color = varied(rng, ["#b3272f", "#2f4fa0", "#d9b23a", "#2f7a4f", "#8a3f8f", "#e0e0dc"])
+    color = vary_color(rng, ["#b3272f", "#2f4fa0", "#d9b23a", "#2f7a4f", "#8a3f8f", "#e0e0dc"])
     return Part(merge([*loops, knot, *tails]), Material(Plain(color), 0.3), placement(at))

@@ -6,7 +6,7 @@ import numpy as np
 
 from extrap_train.geometry.compiled import compiled
 from extrap_train.geometry.warp import occlusion
-from extrap_train.geometry.warp.projection import LEAST_DEPTH_RATIO
+from extrap_train.geometry.warp.query_projection import LEAST_DEPTH_RATIO
 
 _HALF, _ONE, _TWO = np.float32(0.5), np.float32(1), np.float32(2)
 _LEAST_RATIO = np.float32(LEAST_DEPTH_RATIO)

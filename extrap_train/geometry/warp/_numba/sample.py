@@ -14,11 +14,11 @@ from torch import Tensor
 
 from extrap_train.geometry.compiled import compiled
 from extrap_train.geometry.encoding import coordinate_grid
-from extrap_train.geometry.flow import flow_at_pixels
+from extrap_train.geometry.spline_flow import flow_at_pixels
 from extrap_train.geometry.warp import occlusion, sample
 from extrap_train.geometry.warp._numba.occlusion import draw_occlusion, project
 from extrap_train.geometry.warp._numba.surface import find_surface
-from extrap_train.geometry.warp.projection import LEAST_DEPTH_RATIO, reference_to_query_pixels
+from extrap_train.geometry.warp.query_projection import LEAST_DEPTH_RATIO, reference_to_query_pixels
 from extrap_train.geometry.warp.sample import query_centers
 from extrap_train.views import Camera
 

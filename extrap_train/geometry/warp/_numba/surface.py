@@ -131,10 +131,10 @@ def _connect(
         beyond_before, beyond_after = to_after, to_before
         if before != _LINKED and after == _LINKED and kinds[i + 2] == _LINKED:
             inner = inverse[pixel + 2 * stride] - inverse[pixel + stride]
-            beyond_before = _continued(to_after, inner)
+            beyond_before = _extend_slope(to_after, inner)
         if after != _LINKED and before == _LINKED and kinds[i - 1] == _LINKED:
             inner = inverse[pixel - stride] - inverse[pixel - 2 * stride]
-            beyond_after = _continued(to_before, inner)
+            beyond_after = _extend_slope(to_before, inner)
         slopes[side, pixel] = to_before if before == _LINKED else beyond_before
         slopes[side + 1, pixel] = to_after if after == _LINKED else beyond_after
         linked = (before == _LINKED) | (after == _LINKED) << 1
@@ -145,7 +145,7 @@ def _connect(
 
 
 @compiled()
-def _continued(slope: float, inner: float) -> float:
+def _extend_slope(slope: float, inner: float) -> float:
     """The slope beyond the end of a surface: changing on as it did just inside, at most
     twofold."""
     grown = slope - inner

@@ -14,7 +14,7 @@ from extrap_train.config import (
 from extrap_train.device import fastest_device
 from extrap_train.errors import InputError
 from extrap_train.matching import Matcher
-from extrap_train.matching.flow import FlowMatcher
+from extrap_train.matching.dense_flow import FlowMatcher
 
 
 def matcher(

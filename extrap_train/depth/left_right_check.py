@@ -22,7 +22,7 @@ def forward_backward_error(
     """How many pixels from where it started a pixel returns: there by its own depth, back by the
     other view's. Infinite where the other view does not see the point."""
     there = projection_between(camera, other_camera)
-    coordinates, inside = there.normalised(inverse_depth)
+    coordinates, inside = there.normalised_points(inverse_depth)
     found = functional.grid_sample(
         other_inverse_depth[None, None],
         coordinates[None],

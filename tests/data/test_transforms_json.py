@@ -8,8 +8,8 @@ import torch
 from captures import SCENE, view_at
 from PIL import Image
 
-from extrap_train.data.posed import read_transforms
 from extrap_train.data.square_frames import CaptureKeys
+from extrap_train.data.transforms_json import read_transforms
 from extrap_train.errors import InputError
 from extrap_train.geometry.opengl import opengl_from_world_to_cam
 

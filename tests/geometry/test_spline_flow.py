@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import BSpline
 
-from extrap_train.geometry.flow import bspline_basis, dense_flow, fit_flow, flow_at
+from extrap_train.geometry.spline_flow import bspline_basis, dense_flow, fit_flow, flow_at
 
 
 def scattered(count: int, seed: int = 0) -> torch.Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from extrap_train.data.camera_check import OPENGL_POSES
 from extrap_train.data.json_files import read_json
-from extrap_train.data.lens_keys import LENS_KEYS, lens_of, merged_entry
+from extrap_train.data.lens_keys import LENS_KEYS, lens_of, merge_entry
 from extrap_train.data.listed_files import ListedFiles
 from extrap_train.data.paths import check_relative
 from extrap_train.data.photograph_loader import DepthFile
@@ -21,7 +21,7 @@ from extrap_train.data.photographs import (
     sequence_of_photographs,
 )
 from extrap_train.data.picture_files import MAX_PIXELS, image_size
-from extrap_train.data.sequences import PointCloud, Sequence
+from extrap_train.data.sequences import FrameSequence, PointCloud
 from extrap_train.data.validation import require_dict, require_list
 from extrap_train.errors import InputError
 from extrap_train.geometry.opengl import world_to_cam_from_opengl
@@ -39,7 +39,7 @@ LAST_ROW_TOLERANCE = 1e-6
 """Of a matrix's last row, relative to its last number."""
 
 
-def read_transforms(folder: Path) -> Sequence:
+def read_transforms(folder: Path) -> FrameSequence:
     """The capture in a folder with a `transforms.json`; distortion is undone when a frame is read.
 
     Size, intrinsics and distortion may stand for a frame alone or for all. The world is the file's,
@@ -49,7 +49,9 @@ def read_transforms(folder: Path) -> Sequence:
     file = folder / TRANSFORMS
     files = ListedFiles(folder)
     content, entries = _read_entries(file)
-    listed = [_listed(files, content, entry, index, file) for index, entry in enumerate(entries)]
+    listed = [
+        _listed_picture(files, content, entry, index, file) for index, entry in enumerate(entries)
+    ]
     cloud = content.get("ply_file_path")
     return sequence_of_photographs(
         files,
@@ -71,7 +73,7 @@ def read_cameras(file: Path) -> tuple[list[str], Camera]:
     content, entries = _read_entries(file)
     names, cameras = [], []
     for index, entry in enumerate(entries):
-        entry = merged_entry(content, require_dict(entry, f"an object as frame {index}", file))
+        entry = merge_entry(content, require_dict(entry, f"an object as frame {index}", file))
         name = check_relative(str(entry.get("file_path", f"{index:03d}")), file)
         if "w" not in entry or "h" not in entry:
             raise InputError(f"{file}: neither the file nor its entry {name} has w and h; add them")
@@ -91,14 +93,14 @@ def _read_entries(file: Path) -> tuple[dict[str, Any], list[Any]]:
     return {key: value for key, value in content.items() if key in KEYS}, entries
 
 
-def _listed(
+def _listed_picture(
     files: ListedFiles, content: dict[str, Any], entry: Any, index: int, file: Path
 ) -> Listed:
     what = f"an object with a text `file_path` as frame {index}"
     path = require_dict(entry, what, file).get("file_path")
     if not isinstance(path, str):
         raise InputError(f"{file}: expected {what}; correct the entry")
-    merged = merged_entry(content, entry)
+    merged = merge_entry(content, entry)
     for key in ("depth_file_path", "depth_path", "mask_path"):
         if merged.get(key):
             check_relative(str(merged[key]), file)

@@ -8,7 +8,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from extrap_train.depth import DepthMap
-from extrap_train.depth.resample import resampled
 from extrap_train.errors import InputError
 from extrap_train.views import View
 
@@ -36,7 +35,7 @@ class Fit:
         whole = DepthMap(
             functional.pad(depth_map.depth, margins), functional.pad(depth_map.confidence, margins)
         )
-        return resampled(whole, height, width)
+        return whole.resized(height, width)
 
 
 def fit(view: View, image_size: int, patch: int, square: bool) -> Fit:

@@ -22,7 +22,7 @@ from extrap_train.depth.monocular import MonocularDepth
 from extrap_train.depth.stereo import PlaneSweepStereo
 from extrap_train.device import fastest_device
 from extrap_train.errors import InputError
-from extrap_train.matching.build import matcher
+from extrap_train.matching.matchers import matcher
 
 
 def depth_source(config: DepthConfig, device: torch.device | None = None) -> DepthSource:

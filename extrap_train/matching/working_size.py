@@ -9,12 +9,12 @@ LUMA = (0.299, 0.587, 0.114)
 """Weights of the colours in a grey picture (Rec. 601)."""
 
 
-def grey(image: Float[Tensor, "3 h w"]) -> Float[Tensor, "h w"]:
+def to_grey(image: Float[Tensor, "3 h w"]) -> Float[Tensor, "h w"]:
     """Brightness in [0, 1]."""
     return torch.einsum("chw,c->hw", image, image.new_tensor(LUMA))
 
 
-def resized(planes: Float[Tensor, "c h w"], height: int, width: int) -> Float[Tensor, "c h2 w2"]:
+def resize(planes: Float[Tensor, "c h w"], height: int, width: int) -> Float[Tensor, "c h2 w2"]:
     """Resampled, with averaging where it shrinks."""
     shrinks = height < planes.shape[1] or width < planes.shape[2]
     return functional.interpolate(
@@ -22,7 +22,7 @@ def resized(planes: Float[Tensor, "c h w"], height: int, width: int) -> Float[Te
     )[0].clamp(0, 1)
 
 
-def pixels_of(
+def to_image_pixels(
     indices: Float[Tensor, "n 2"], working: torch.Size, size: torch.Size
 ) -> Float[Tensor, "n 2"]:
     """Pixels (u, v), centres at +0.5, of a picture whose shape `size` ends in height and width.

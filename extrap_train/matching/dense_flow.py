@@ -15,8 +15,9 @@ from extrap_train.config import FlowMatcherConfig
 from extrap_train.geometry.cameras import pixel_grid
 from extrap_train.geometry.fill import fill_holes
 from extrap_train.geometry.ncc import windowed_correlation
+from extrap_train.geometry.resample import sample_pixels
 from extrap_train.matching import DenseFlow, Matches
-from extrap_train.matching.pictures import grey, resized
+from extrap_train.matching.working_size import resize, to_grey
 
 LARGEST_ENLARGEMENT = 2.0
 """Enlarged twice, small pictures are matched to about a tenth of a pixel; more brings nothing."""
@@ -55,7 +56,7 @@ class FlowMatcher:
         colours, there = (image.detach().float().cpu() for image in (first, second))
         known = torch.ones_like(colours[0]) if first_known is None else first_known.float().cpu()
         filled = fill_holes(colours[None], known[None])[0]
-        forward, backward = self._both_ways(grey(filled), grey(there))
+        forward, backward = self._both_ways(to_grey(filled), to_grey(there))
         found, inside = _sample(torch.cat([there, backward]), forward)
         error = (forward + found[3:]).norm(dim=0)
         correlation = windowed_correlation(filled, found[:3], known)
@@ -67,14 +68,14 @@ class FlowMatcher:
         self, first: Float[Tensor, "h w"], second: Float[Tensor, "h2 w2"]
     ) -> tuple[Float[Tensor, "2 h w"], Float[Tensor, "2 h2 w2"]]:
         scale = min(LARGEST_ENLARGEMENT, self.config.image_size / max(*first.shape, *second.shape))
-        working = [_scaled(picture, scale) for picture in (first, second)]
+        working = [_rescale(picture, scale) for picture in (first, second)]
         size = tuple(
             max(LEAST_SIDE, *sides) for sides in zip(*(x.shape for x in working), strict=True)
         )
-        a, b = (_bytes(_padded(picture, size)) for picture in working)
+        a, b = (_bytes(_pad(picture, size)) for picture in working)
         return (
-            _restored(_inverse_search(a, b), working[0].shape, first.shape),
-            _restored(_inverse_search(b, a), working[1].shape, second.shape),
+            _restore_flow(_inverse_search(a, b), working[0].shape, first.shape),
+            _restore_flow(_inverse_search(b, a), working[1].shape, second.shape),
         )
 
 
@@ -87,12 +88,12 @@ def _inverse_search(
     return torch.from_numpy(search.calc(first, second, start)).permute(2, 0, 1)
 
 
-def _scaled(picture: Float[Tensor, "h w"], scale: float) -> Float[Tensor, "h2 w2"]:
+def _rescale(picture: Float[Tensor, "h w"], scale: float) -> Float[Tensor, "h2 w2"]:
     height, width = (max(1, round(side * scale)) for side in picture.shape)
-    return resized(picture[None], height, width)[0]
+    return resize(picture[None], height, width)[0]
 
 
-def _padded(picture: Float[Tensor, "h w"], size: tuple[int, ...]) -> Float[Tensor, "h2 w2"]:
+def _pad(picture: Float[Tensor, "h w"], size: tuple[int, ...]) -> Float[Tensor, "h2 w2"]:
     below, right = size[0] - picture.shape[0], size[1] - picture.shape[1]
     return functional.pad(picture[None, None], (0, right, 0, below), mode="replicate")[0, 0]
 
@@ -101,7 +102,7 @@ def _bytes(picture: Float[Tensor, "h w"]) -> UInt8[np.ndarray, "h w"]:
     return picture.mul(255).round().clamp(0, 255).to(torch.uint8).numpy()
 
 
-def _restored(
+def _restore_flow(
     flow: Float[Tensor, "2 h w"], working: torch.Size, size: torch.Size
 ) -> Float[Tensor, "2 h2 w2"]:
     """The flow of the working picture's part, in pixels of the picture of `size`."""
@@ -120,10 +121,4 @@ def _sample(
     size = flow.new_tensor([planes.shape[2], planes.shape[1]])
     there = pixel_grid(*flow.shape[1:]) + flow.permute(1, 2, 0)
     inside = ((there >= 0) & (there <= size)).all(-1)
-    sampled = functional.grid_sample(
-        planes[None],
-        (there / size * 2 - 1)[None],
-        padding_mode="border",
-        align_corners=False,
-    )
-    return sampled[0], inside
+    return sample_pixels(planes, there), inside

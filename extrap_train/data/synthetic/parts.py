@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from extrap_train.data.synthetic.light import Light, ambient_light
 from extrap_train.data.synthetic.material import Material
-from extrap_train.data.synthetic.shapes import Mesh, Point, merge, moved
+from extrap_train.data.synthetic.shapes import Mesh, Point, merge, move_mesh
 from extrap_train.data.synthetic.vectors import Real
 from extrap_train.geometry.compiled import compiled
 
@@ -71,7 +71,7 @@ class SyntheticScene:
     @cached_property
     def mesh(self) -> Mesh:
         """All parts in world coordinates."""
-        return merge([moved(part.mesh, part.part_to_world) for part in self.parts])
+        return merge([move_mesh(part.mesh, part.part_to_world) for part in self.parts])
 
     @cached_property
     def part_of_face(self) -> Int[np.ndarray, " f"]:

@@ -10,7 +10,7 @@ from extrap_train.config import FlowMatcherConfig
 from extrap_train.data.co3d import read_category
 from extrap_train.geometry.cameras import pixel_grid
 from extrap_train.matching import Matcher, Matches
-from extrap_train.matching.build import matcher
+from extrap_train.matching.matchers import matcher
 
 FLOW = matcher(FlowMatcherConfig())
 MOTIONS = {

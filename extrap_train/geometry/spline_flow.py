@@ -8,7 +8,8 @@ are 2 / (g − 3) apart, so that a field bends about that fast and no faster.
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn import functional
+
+from extrap_train.geometry.resample import sample_pixels
 
 STIFFNESS = 1e-5
 """Weight of the field's second differences against one per match: decides only where none are."""
@@ -50,12 +51,8 @@ def flow_at_pixels(
     would cost much more.
     """
     field = dense_flow(control, height, width)
-    size = pixels.new_tensor([width, height])
-    at = (pixels.mT / size * 2 - 1)[None, None]
-    found = functional.grid_sample(
-        field[None].to(pixels), at, padding_mode="border", align_corners=False
-    )
-    return found[0, :, 0] * (size / 2)[:, None]
+    size = pixels.new_tensor([[width], [height]])
+    return sample_pixels(field.to(pixels), pixels.mT) * (size / 2)
 
 
 def bspline_basis(positions: Float[Tensor, " n"], count: int) -> Float[Tensor, "n g"]:
