@@ -7,7 +7,7 @@ import errno
 import io
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -110,6 +110,17 @@ def _compose(options: CommandOptions, run: Callable[[Any], Outcome | Path | None
         composed()
     except (HydraException, OmegaConfBaseException) as error:
         raise InputError(explain(error, options, sys.argv[1:])) from None
+
+
+def compose_config(options: CommandOptions, words: Sequence[str]) -> Any:
+    """The checked configuration that these words of a command line stand for."""
+    register_schemas()
+    try:
+        with hydra.initialize_config_module("conf", version_base="1.3"):
+            prepared = CommandLine.split(words).prepared(options)
+            return typed_config(hydra.compose(options.config_name, prepared))
+    except (HydraException, OmegaConfBaseException) as error:
+        raise InputError(explain(error, options, words)) from None
 
 
 def _complete(options: CommandOptions, run: Callable[[Any], Outcome | Path | None]) -> None:

@@ -112,7 +112,7 @@ def curve(steps: list[int], series: dict[str, list[float]], label: str, path: Pa
     write_atomic(path, content.getvalue())
 
 
-def picture(image: Float[Tensor, "3 h w"], path: Path) -> None:
+def save_picture(image: Float[Tensor, "3 h w"], path: Path) -> None:
     """Write one picture as PNG."""
     content = io.BytesIO()
     Image.fromarray(to_eight_bits(image).transpose(1, 2, 0)).save(content, "png")

@@ -41,6 +41,7 @@ _ORDER = (
     "extrap_train.cli",
     "data_prep",
     "benchmarks",
+    "extrap_train.api",
 )
 """Every room imports only from rooms before it, so there is no cycle between rooms or packages."""
 _PACKAGES = ("extrap_train", "data_prep", "benchmarks")

@@ -257,7 +257,7 @@ python -m extrap_train task=view category=NAME {command} orbit=360 adapter=FOLDE
 ```
 
 ```python
-from extrap_train.tasks.view import open_generator
+from extrap_train import open_generator
 
 generator = open_generator({weights!r}, adapter="FOLDER")
 ```

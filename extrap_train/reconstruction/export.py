@@ -12,7 +12,7 @@ from plyfile import PlyData, PlyElement
 from extrap_train.data.images import to_eight_bits
 from extrap_train.geometry.colmap import colmap_from_world_to_cam
 from extrap_train.geometry.opengl import opengl_from_world_to_cam
-from extrap_train.pictures import picture, picture_names
+from extrap_train.pictures import picture_names, save_picture
 from extrap_train.reconstruction.cloud import PointCloud
 from extrap_train.reconstruction.global_map import GlobalMap, MapView
 from extrap_train.reconstruction.inputs import WorldUnit
@@ -45,7 +45,7 @@ def write_views(known: GlobalMap, unit: WorldUnit, folder: Path) -> None:
     """
     entries = []
     for stem, view in zip(_stems(known), known.views, strict=True):
-        picture(view.view.image, folder / "views" / f"{stem}.png")
+        save_picture(view.view.image, folder / "views" / f"{stem}.png")
         _write_array(view.depth * unit.unit / DEPTH_UNIT, folder / "views" / f"{stem}.depth.npy")
         _write_array(view.confidence, folder / "views" / f"{stem}.confidence.npy")
         entries.append(_entry(view, stem, unit.outside(view.camera)))

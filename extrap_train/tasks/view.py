@@ -1,6 +1,6 @@
 """`task=view`: the picture from a pose, or a walk around the scene, and the warp it came from.
 
-The same in Python: `open_generator`, `open_views`, `walk`.
+The same in Python: `extrap_train.open_generator`, `open_views` and `walk_around`.
 """
 
 import math
@@ -12,25 +12,16 @@ import torch
 from rich.console import Console
 
 from extrap_train.config import (
-    DatasetDepthConfig,
-    DepthConfig,
-    ModelConfig,
-    SamplerConfig,
     TrainConfig,
-    TrainerConfig,
 )
-from extrap_train.data.scene import open_scene
-from extrap_train.data.scene_views import input_views, select_input_frames
 from extrap_train.data.sequences import FrameSequence
 from extrap_train.data.square_frames import object_square
 from extrap_train.data.transforms_json import read_cameras
-from extrap_train.depth.sources import depth_source
-from extrap_train.device import fastest_device
-from extrap_train.diffusion.generator import DiffusionGenerator, GeneratedViews
+from extrap_train.diffusion.generator import GeneratedViews
 from extrap_train.errors import InputError, did_you_mean
 from extrap_train.geometry.orbits import LEAST_VIEWS, orbit_cameras
 from extrap_train.metrics import psnr, quantised
-from extrap_train.pictures import contact_sheet, film, mark_holes, picture, picture_names
+from extrap_train.pictures import contact_sheet, film, mark_holes, picture_names, save_picture
 from extrap_train.store.cache import claim
 from extrap_train.store.records import write_record
 from extrap_train.tasks.scene_content import photograph_digests, scene_manifest
@@ -48,7 +39,6 @@ from extrap_train.tasks.scene_model import (
     frames_learnt,
     generate_views,
     model_options,
-    open_model,
     scene_generator,
     trained_model,
 )
@@ -111,7 +101,7 @@ def run(config: TrainConfig) -> None:
         with result.replace() as whole:
             _write(made, inputs.views, query.names, whole, walk=config.orbit is not None)
             if truth is not None:
-                picture(truth.image, whole / "truth.png")
+                save_picture(truth.image, whole / "truth.png")
             names = {view.name for view in inputs.views}
             read = photograph_digests(f for f in sequence.frames if f.name in names)
             shown = dict(zip(query.names, _shares(made), strict=True))
@@ -160,41 +150,7 @@ def _compare(
     return float(psnr(quantised(made.images), quantised(truth.image[None]))), ""
 
 
-def open_generator(
-    weights: str,
-    adapter: str | None = None,
-    sampler: SamplerConfig | None = None,
-    config: ModelConfig | None = None,
-    *,
-    device: torch.device | str | None = None,
-    precision: str = TrainerConfig.precision,
-) -> DiffusionGenerator:
-    """The generator of a model folder, of a packaged model, or of a published checkpoint, which
-    `config` describes; without `sampler` it samples as the model recommends.
-
-    It runs where and in what the commands do: on the GPU where there is one, in `bf16-mixed`.
-    """
-    model = open_model(weights, adapter, config).to(device or fastest_device())
-    return DiffusionGenerator(model, sampler or model.config.sampler, precision=precision)
-
-
-def open_views(
-    scene: str,
-    generator: DiffusionGenerator,
-    inputs: int | None = None,
-    depth: DepthConfig | None = None,
-) -> list[View]:
-    """A scene's views with depth, as the generator takes them: `inputs` spread ones, or all.
-
-    `depth` is the data set's own by default; `StereoConfig()` estimates it.
-    """
-    sequence = open_scene(scene)
-    chosen = select_input_frames(sequence, (), inputs)
-    source = depth_source(depth or DatasetDepthConfig())
-    return input_views(sequence, chosen, source, generator.warp_size)
-
-
-def walk(views: Sequence[View], degrees: float, frames: int) -> tuple[Camera, list[str]]:
+def walk_around(views: Sequence[View], degrees: float, frames: int) -> tuple[Camera, list[str]]:
     """Cameras around what the views look at, from the first view's azimuth on, and their names."""
     _require_orbit(len(views))
     cameras = stack_cameras([view.camera for view in views])
@@ -249,7 +205,7 @@ def _cameras(
     if query.cameras is not None:
         return query.cameras, None
     assert config.orbit is not None
-    return walk(views, config.orbit, config.frames)[0], None
+    return walk_around(views, config.orbit, config.frames)[0], None
 
 
 def _write(
@@ -261,8 +217,8 @@ def _write(
             film(made.images, folder / f"orbit.{end}")
             film(warps, folder / f"orbit_warp.{end}")
     for stem, image, warp in zip(picture_names(names), made.images, warps, strict=True):
-        picture(image, folder / "views" / f"{stem}.png")
-        picture(warp, folder / "views" / f"{stem}_warp.png")
+        save_picture(image, folder / "views" / f"{stem}.png")
+        save_picture(warp, folder / "views" / f"{stem}_warp.png")
     size = made.images.shape[-1]
     nearest = torch.stack([views[row[0]].resized(size, size).image for row in made.references])
     shown = {"nearest photo": nearest, "warp": warps, "view": made.images}

@@ -2,12 +2,12 @@
 
 import torch
 
+from extrap_train import open_generator
 from extrap_train.config import ModelConfig, SamplerConfig
 from extrap_train.diffusion.checkpoint import load_model
 from extrap_train.diffusion.model import ExtrapolationModel, use_channels_last
 from extrap_train.diffusion.packaged import packaged_weights
 from extrap_train.diffusion.sampler import sample_views
-from extrap_train.tasks.view import open_generator
 from extrap_train.views import PairBatch
 
 

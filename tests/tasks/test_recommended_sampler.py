@@ -8,6 +8,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from benchmarks.methods.diffusion import Diffusion
+from extrap_train import open_generator
 from extrap_train.cli import register_schemas
 from extrap_train.config import ModelConfig, SamplerConfig, TrainConfig, UNetConfig, sampler_for
 from extrap_train.config.options import check_options
@@ -15,7 +16,6 @@ from extrap_train.diffusion.checkpoint import load_model, save_model
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.errors import InputError
-from extrap_train.tasks.view import open_generator
 
 _PAPER = SamplerConfig(steps=50, guidance=3.0)
 _PUBLISHED = replace(_PAPER, eta=1.0)

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from extrap_train import open_generator, open_views, walk_around
 from extrap_train.config import LoraConfig, SyntheticConfig
 from extrap_train.data.scene import open_scene
 from extrap_train.diffusion.checkpoint import load_model, save_model
@@ -19,7 +20,6 @@ from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.diffusion.lora import AdapterOrigin, add_adapter, save_adapter
 from extrap_train.pictures import picture_names
 from extrap_train.tasks.scene_content import frame_digest
-from extrap_train.tasks.view import open_generator, open_views, walk
 
 
 def test_a_walk_around_the_scene_is_pictures_and_films(command, weights, tmp_path) -> None:
@@ -72,12 +72,12 @@ def test_the_photograph_that_is_asked_for_is_no_input(
 
 def test_the_same_in_three_lines_of_python(weights) -> None:
     generator = open_generator(str(weights), device="cpu", precision="32-true")
-    views = open_views("synthetic:cup/0001", generator, inputs=3)
-    images = generator.generate(views, *walk(views, degrees=90.0, frames=2)).images
+    views = open_views("synthetic:cup/0001", inputs=3, size=generator.warp_size)
+    images = generator.generate(views, *walk_around(views, degrees=90.0, frames=2)).images
     assert images.shape == (2, 3, 16, 16)
     lower = open_generator(str(weights), device="cpu")
     assert lower.precision == "bf16-mixed"
-    again = lower.generate(views, *walk(views, degrees=90.0, frames=2)).images
+    again = lower.generate(views, *walk_around(views, degrees=90.0, frames=2)).images
     assert again.dtype == images.dtype
     assert 0 < (again - images).abs().max() < 0.1
 

@@ -10,10 +10,10 @@ from PIL import Image
 from published_networks import TINY_MODEL, Reference, tiny_config
 from safetensors.torch import load_file
 
+from extrap_train import open_generator
 from extrap_train.__main__ import main
 from extrap_train.diffusion.checkpoint import initial_model, save_model
 from extrap_train.errors import InputError
-from extrap_train.tasks.view import open_generator
 
 _SCENE = ["category=hydrant", "scene=synthetic:hydrant/0000", "data.frames=6", "data.image_size=32"]
 
