@@ -17,6 +17,7 @@ from PIL import Image
 from plyfile import PlyData, PlyParseError
 from torch import Tensor
 
+from extrap_train.data.images import ARRAY_ERRORS
 from extrap_train.data.picture_files import DECODER_ERRORS
 from extrap_train.errors import InputError
 
@@ -82,7 +83,7 @@ def array_of(content: bytes, shape: tuple[int | None, ...], file: Path) -> Tenso
         )
         if dtype != np.float32 or is_fortran or not fits or rest != 4 * math.prod(found):
             raise ValueError(f"{dtype} of shape {found}")
-    except (ValueError, SyntaxError, EOFError) as error:
+    except ARRAY_ERRORS as error:
         reason = " ".join(str(error).split())[:200]
         raise InputError(f"{file}: is no such array ({reason}); run the table again") from None
     values = torch.from_numpy(np.frombuffer(stream.read(), np.float32).copy())

@@ -42,6 +42,11 @@ def _claiming(shape: tuple[int, ...]) -> bytes:
     return content.getvalue()
 
 
+def _stating(header: bytes) -> bytes:
+    """An NPY file with this header and no numbers."""
+    return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
+
+
 def _edit(file: Path, edit: Callable[[Any], Any]) -> None:
     content = json.loads(file.read_text())
     edit(content)
@@ -114,6 +119,9 @@ DAMAGE = {
     "text_array": _truth("truth/depth.npy", _npy(np.array(["a"]))),
     "pickle": _truth("truth/depth.npy", _npy(np.array([{}], dtype=object))),
     "claim": _truth("truth/depth.npy", _claiming((6, 24, 10**12))),
+    "unclosed": _truth("truth/depth.npy", _stating(b"{'shape': " + b"(" * 50)),
+    "nested": _truth("truth/depth.npy", _stating(b"{'shape': " + b"(" * 5000 + b")" * 5000)),
+    "endless": _truth("truth/object.npy", _stating(b"{'shape': (" + b"9" * 5000 + b",)}")),
     "other_shape": _truth("truth/object.npy", _npy(np.zeros((5, 2), np.float32))),
     "nan": _truth("truth/object.npy", _npy(np.full((5, 3), np.nan, np.float32))),
     "draw": _entry("draw", None),

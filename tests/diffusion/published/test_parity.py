@@ -124,7 +124,7 @@ def test_widening_leaves_the_output_as_it_was(
     told = torch.cat([given["unet_input"], torch.randn(2, extra, 32, 32)], 1)
     before = published.unet(given["unet_input"], given["unet_timestep"], token).sample
     after = widened.unet(told, given["unet_timestep"], token).sample
-    torch.testing.assert_close(after, before, atol=1e-6, rtol=0)
+    torch.testing.assert_close(after, before, atol=1e-5 * float(before.std()), rtol=0)
 
 
 @torch.no_grad()
