@@ -1,15 +1,79 @@
-"""Cameras on a circle around what a few views look at."""
+"""Circles of cameras around what a few views look at."""
+
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from extrap_train.geometry.viewpoints import camera_centers, directions_from, fit_orbit
+from extrap_train.geometry.viewpoints import (
+    camera_centers,
+    directions_from,
+    fit_orbit,
+    scene_center,
+)
 from extrap_train.views import Camera
 
 LEAST_VIEWS = 3
-"""Fewer do not say which way their orbit leans."""
+"""Fewer do not show which way their orbit leans."""
+
+Angles = Float[np.ndarray, "*n"] | float
+
+
+@dataclass(frozen=True)
+class Circle:
+    """A way around a scene: azimuths about an axis, elevations towards it."""
+
+    center: Float[np.ndarray, "3"]
+    axis: Float[np.ndarray, "3"]
+    """Unit length, upwards in the photographs."""
+    east: Float[np.ndarray, "3"]
+    """Unit length; azimuth 0, where the first view stands."""
+
+    @classmethod
+    def around(
+        cls, center: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"], views: Camera
+    ) -> "Circle":
+        """Starts at the first of the views."""
+        first = directions_from(views[:1], center)[0]
+        east = first - (first @ axis) * axis
+        return cls(center, axis, east / np.linalg.norm(east))
+
+    def locate(
+        self, positions: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """Azimuths in [0, 2π), elevations in [−π/2, π/2], both in radians, and distances."""
+        offsets = positions - self.center
+        distances = np.linalg.norm(offsets, axis=1)
+        directions, north = offsets / distances[:, None], np.cross(self.axis, self.east)
+        azimuths = np.arctan2(directions @ north, directions @ self.east) % (2 * np.pi)
+        return azimuths, np.arcsin(np.clip(offsets @ self.axis / distances, -1, 1)), distances
+
+    def poses(
+        self, azimuths_rad: Float[np.ndarray, " n"], elevation_rad: Angles, distance: Angles
+    ) -> Float[np.ndarray, "n 4 4"]:
+        """`world_to_cam` of cameras that stand there, look at the centre and are held upright."""
+        azimuth = azimuths_rad[:, None]
+        elevation, far = (
+            np.broadcast_to(x, len(azimuth))[:, None] for x in (elevation_rad, distance)
+        )
+        north = np.cross(self.axis, self.east)
+        level = np.cos(azimuth) * self.east + np.sin(azimuth) * north
+        out = np.cos(elevation) * level + np.sin(elevation) * self.axis
+        return looking_at(self.center + far * out, self.center, self.axis)
+
+
+def fit_circle(cameras: Camera) -> Circle:
+    """The circle of two or more cameras that look at a scene from one side or from all.
+
+    The axis is the direction that the cameras' horizontal axes have least in common with: a few
+    photographs from one side do not show which way their positions bend, but all are held upright.
+    """
+    right = cameras.world_to_cam[:, 0, :3].double().numpy(force=True)
+    axis = np.linalg.eigh(right.T @ right)[1][:, 0]
+    up = -cameras.world_to_cam[:, 1, :3].double().numpy(force=True).mean(0)
+    return Circle.around(scene_center(cameras), axis if axis @ up > 0 else -axis, cameras)
 
 
 def orbit_cameras(views: Camera, span_rad: float, count: int) -> Camera:
@@ -22,15 +86,10 @@ def orbit_cameras(views: Camera, span_rad: float, count: int) -> Camera:
     if len(views.world_to_cam) < LEAST_VIEWS:
         raise ValueError(f"an orbit needs {LEAST_VIEWS} views, not {len(views.world_to_cam)}")
     orbit = fit_orbit(views)
-    first = directions_from(views[:1], orbit.center)[0]
-    east = first - (first @ orbit.axis) * orbit.axis
-    east /= np.linalg.norm(east)
-    azimuths = span_rad / count * np.arange(count)[:, None]
-    level = np.cos(azimuths) * east + np.sin(azimuths) * np.cross(orbit.axis, east)
-    elevation = np.median(orbit.elevations_rad)
-    distance = np.median(np.linalg.norm(camera_centers(views) - orbit.center, axis=1))
-    out = np.cos(elevation) * level + np.sin(elevation) * orbit.axis
-    matrices = looking_at(orbit.center + distance * out, orbit.center, orbit.axis)
+    circle = Circle.around(orbit.center, orbit.axis, views)
+    _, elevations_rad, distances = circle.locate(camera_centers(views))
+    azimuths_rad = span_rad / count * np.arange(count)
+    matrices = circle.poses(azimuths_rad, np.median(elevations_rad), np.median(distances))
     return Camera(
         torch.from_numpy(matrices).to(views.world_to_cam.dtype),
         _central_lens(views).expand(count, 3, 3).clone(),

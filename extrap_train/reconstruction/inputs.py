@@ -13,6 +13,7 @@ from extrap_train.data.sequences import Frame
 from extrap_train.data.validation import is_degenerate
 from extrap_train.depth import RELIABLE_CONFIDENCE, DepthSource
 from extrap_train.errors import InputError
+from extrap_train.geometry.orbits import fit_circle
 from extrap_train.geometry.viewpoints import (
     camera_centers,
     facing,
@@ -22,7 +23,6 @@ from extrap_train.geometry.viewpoints import (
 )
 from extrap_train.reconstruction.continuation import continued_depth
 from extrap_train.reconstruction.new_view import CONTINUED_CONFIDENCE
-from extrap_train.reconstruction.planner import fit_circle
 from extrap_train.views import Camera, View, stack_poses
 
 ONE_SIDED_STEP_RAD = np.radians(25)
@@ -102,7 +102,7 @@ def choose_frames(
     if draw == "spread":
         chosen = farthest_point_sample(camera_centers(cameras), count, start)
         return sorted(int(index) for index in chosen)
-    azimuths = fit_circle(cameras).azimuths_rad(cameras)
+    azimuths, _, _ = fit_circle(cameras).locate(camera_centers(cameras))
     for first in (start, *np.argsort(azimuths)):
         walk = [int(first)]
         while len(walk) < count:

@@ -6,13 +6,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from extrap_train.geometry.orbits import looking_at
-from extrap_train.geometry.viewpoints import (
-    camera_centers,
-    directions_from,
-    pairwise_angles,
-    scene_center,
-)
+from extrap_train.geometry.orbits import fit_circle
+from extrap_train.geometry.viewpoints import camera_centers, pairwise_angles, scene_center
 from extrap_train.geometry.warp import warp_references
 from extrap_train.reconstruction.global_map import GlobalMap
 from extrap_train.views import Camera, stack_cameras
@@ -34,73 +29,29 @@ class Query:
     camera: Camera
 
 
-@dataclass(frozen=True)
-class Circle:
-    """The inputs' way around the scene, as azimuths about an axis."""
-
-    center: Float[np.ndarray, "3"]
-    axis: Float[np.ndarray, "3"]
-    """Unit length, upwards in the photographs."""
-    east: Float[np.ndarray, "3"]
-    """Azimuth 0: the first input."""
-
-    def azimuths_rad(self, cameras: Camera) -> Float[np.ndarray, " n"]:
-        """In [0, 2π)."""
-        directions = directions_from(cameras, self.center)
-        north = np.cross(self.axis, self.east)
-        return np.arctan2(directions @ north, directions @ self.east) % (2 * np.pi)
-
-
-def fit_circle(cameras: Camera) -> Circle:
-    """The circle of two or more cameras that look at a scene from one side or from all.
-
-    The axis is the direction that the cameras' horizontal axes have least in common with: a few
-    photographs from one side do not show which way their positions bend, but all are held upright.
-    """
-    center = scene_center(cameras)
-    right = cameras.world_to_cam[:, 0, :3].double().numpy(force=True)
-    axis = np.linalg.eigh(right.T @ right)[1][:, 0]
-    up = -cameras.world_to_cam[:, 1, :3].double().numpy(force=True).mean(0)
-    axis = axis if axis @ up > 0 else -axis
-    first = directions_from(cameras[:1], center)[0]
-    east = first - (first @ axis) * axis
-    return Circle(center, axis, east / np.linalg.norm(east))
-
-
 def orbit_queries(cameras: Camera, step_rad: float) -> list[Query]:
     """Views that fill the gaps between the inputs' azimuths in even steps of about `step_rad`.
 
     Elevation and distance go over from one end of a gap to the other.
     """
     circle = fit_circle(cameras)
-    azimuths = circle.azimuths_rad(cameras)
-    offsets = camera_centers(cameras) - circle.center
-    distances = np.linalg.norm(offsets, axis=1)
-    elevations = np.arcsin(np.clip(offsets @ circle.axis / distances, -1, 1))
+    azimuths, elevations, distances = circle.locate(camera_centers(cameras))
     order = np.argsort(azimuths, kind="stable")
     queries = []
     for one, other in zip(order, np.roll(order, -1), strict=True):
         gap = (azimuths[other] - azimuths[one]) % (2 * np.pi) or 2 * np.pi
         steps = max(1, round(gap / step_rad))
-        for share in np.arange(1, steps) / steps:
-            azimuth = azimuths[one] + share * gap
-            elevation, distance = (
-                (1 - share) * x[one] + share * x[other] for x in (elevations, distances)
-            )
-            camera = _camera_at(circle, azimuth, elevation, distance, cameras)
-            queries.append(Query(f"orbit{round(np.degrees(azimuth)) % 360:03d}", camera))
+        shares = np.arange(1, steps) / steps
+        gap_azimuths = azimuths[one] + shares * gap
+        elevation, distance = (
+            (1 - shares) * x[one] + shares * x[other] for x in (elevations, distances)
+        )
+        made = _cameras_at(circle.poses(gap_azimuths, elevation, distance), cameras)
+        queries += [
+            Query(f"orbit{round(np.degrees(azimuth)) % 360:03d}", made[i])
+            for i, azimuth in enumerate(gap_azimuths)
+        ]
     return queries
-
-
-def _camera_at(
-    circle: Circle, azimuth_rad: float, elevation_rad: float, distance: float, like: Camera
-) -> Camera:
-    north = np.cross(circle.axis, circle.east)
-    level = np.cos(azimuth_rad) * circle.east + np.sin(azimuth_rad) * north
-    out = np.cos(elevation_rad) * level + np.sin(elevation_rad) * circle.axis
-    matrix = looking_at((circle.center + distance * out)[None], circle.center, circle.axis)[0]
-    intrinsics = like.intrinsics.median(0).values
-    return Camera(torch.from_numpy(matrix).float(), intrinsics, like.height, like.width)
 
 
 def circle_cameras(cameras: Camera, first: Float[np.ndarray, "3"], count: int) -> Camera:
@@ -108,18 +59,17 @@ def circle_cameras(cameras: Camera, first: Float[np.ndarray, "3"], count: int) -
     mean height and distance of some.
     """
     circle = fit_circle(cameras)
-    offset = first - circle.center
-    north = np.cross(circle.axis, circle.east)
-    start = np.arctan2(offset @ north, offset @ circle.east)
-    offsets = camera_centers(cameras) - circle.center
-    distances = np.linalg.norm(offsets, axis=1)
-    elevation = float(np.arcsin(np.clip(offsets @ circle.axis / distances, -1, 1)).mean())
-    return stack_cameras(
-        [
-            _camera_at(circle, start + 2 * np.pi * i / count, elevation, distances.mean(), cameras)
-            for i in range(count)
-        ]
-    )
+    (start,), _, _ = circle.locate(first[None])
+    _, elevations, distances = circle.locate(camera_centers(cameras))
+    azimuths = start + 2 * np.pi * np.arange(count) / count
+    return _cameras_at(circle.poses(azimuths, elevations.mean(), distances.mean()), cameras)
+
+
+def _cameras_at(world_to_cam: Float[np.ndarray, "n 4 4"], like: Camera) -> Camera:
+    """Cameras with the median intrinsics of others."""
+    intrinsics = like.intrinsics.median(0).values.expand(len(world_to_cam), 3, 3).clone()
+    matrices = torch.from_numpy(world_to_cam).float()
+    return Camera(matrices, intrinsics, like.height, like.width)
 
 
 def next_query(known: GlobalMap, queries: list[Query]) -> Query:
