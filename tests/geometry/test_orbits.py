@@ -5,8 +5,9 @@ import pytest
 import torch
 from orbits import even, ring
 
-from extrap_train.geometry.orbits import orbit_cameras
-from extrap_train.geometry.viewpoints import camera_centers
+from extrap_train.geometry.orbits import fit_circle, orbit_cameras
+from extrap_train.geometry.viewpoints import camera_centers, facing
+from extrap_train.views import Camera
 
 
 @pytest.mark.parametrize("inputs", [[0, 1, 2], [0, 4, 8], [3, 5, 9, 10]])
@@ -32,3 +33,27 @@ def test_a_part_of_a_turn_starts_at_the_first_view_and_keeps_its_distance():
 def test_two_views_are_no_orbit():
     with pytest.raises(ValueError, match="an orbit needs 3 views, not 2"):
         orbit_cameras(ring(even(4))[:2], np.pi, 3)
+
+
+def test_cameras_on_a_circle_are_found_where_they_were_put():
+    circle = fit_circle(ring(even(7), elevation_deg=20))
+    azimuths, elevations, distances = np.radians([10, 100, 350]), np.radians([-5, 0, 40]), [1, 2, 3]
+    poses = torch.from_numpy(circle.poses(azimuths, elevations, np.array(distances)))
+    cameras = Camera(poses, torch.eye(3).double().expand(3, 3, 3), 8, 8)
+    for found, given in zip(
+        circle.locate(camera_centers(cameras)), (azimuths, elevations, distances), strict=True
+    ):
+        np.testing.assert_allclose(found, given, atol=1e-9)
+    assert facing(cameras, circle.center, 1e-6).all()
+    up = -cameras.world_to_cam[:, 1, :3].numpy()
+    assert (up @ circle.axis > 0).all()
+
+
+def test_a_circle_starts_at_its_first_view_and_leans_as_its_views_do():
+    views = ring(even(5), elevation_deg=20)
+    circle = fit_circle(views)
+    azimuths, elevations, distances = circle.locate(camera_centers(views))
+    assert np.abs(np.angle(np.exp(1j * azimuths[0]))) < 1e-6
+    np.testing.assert_allclose(circle.axis, [0, 0, 1], atol=1e-5)
+    np.testing.assert_allclose(elevations, np.radians(20), atol=1e-5)
+    np.testing.assert_allclose(distances, 3, rtol=1e-5)
