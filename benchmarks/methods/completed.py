@@ -13,10 +13,11 @@ from extrap_train.config import CompletionConfig, StereoConfig
 from extrap_train.depth.sources import depth_source
 from extrap_train.diffusion.generator import GeneratedViews, ViewGenerator
 from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.geometry.world_frame import WorldFrame
 from extrap_train.reconstruction.cloud import cloud_of
 from extrap_train.reconstruction.completion import Step, Workshop, complete, map_of_inputs
 from extrap_train.reconstruction.global_map import GENERATED, GlobalMap
-from extrap_train.reconstruction.inputs import WorldUnit, first_views, world_unit
+from extrap_train.reconstruction.inputs import first_views, fit_world_frame
 from extrap_train.reconstruction.planner import Query
 from extrap_train.views import Camera, View, stack_cameras
 
@@ -33,7 +34,7 @@ class CompletedDiffusion(Diffusion):
     def painted(self, model: ExtrapolationModel, inputs: SceneInputs) -> Painted:
         """Paint and merge every target; beside the images, the points of the whole map."""
         options = CompletionConfig()
-        unit = world_unit(stack_cameras([view.camera for view in inputs.fine_views]))
+        unit = fit_world_frame(stack_cameras([view.camera for view in inputs.fine_views]))
         size = model.config.warp_size
         views, confidences = first_views(inputs.fine_views, inputs.depth_source, unit, size)
         known = map_of_inputs(views, confidences, options.tolerance)
@@ -93,7 +94,7 @@ def _kept(
     return torch.stack([painter.pictures[name, seeds[name]] for name in names])
 
 
-def _points(known: GlobalMap, unit: WorldUnit, options: CompletionConfig) -> Float[Tensor, "m 3"]:
+def _points(known: GlobalMap, unit: WorldFrame, options: CompletionConfig) -> Float[Tensor, "m 3"]:
     """The map's points that are sure enough, in the photographs' world."""
     cloud = cloud_of(known, votes=options.confidence.votes)
     return unit.points_outside(

@@ -45,7 +45,7 @@ class Fit:
     @torch.no_grad()
     def render(self, targets: Camera) -> Float[Tensor, "n 3 h w"]:
         """The images of cameras of the world (batched `n`), in [0, 1]."""
-        cameras = self.recipe.scene.frame.camera(targets).to(self.recipe.options.device)
+        cameras = self.recipe.scene.frame.inside(targets).to(self.recipe.options.device)
         cameras = self.recipe.target_cameras(cameras)
         count = len(targets.world_to_cam)
         drawn = [self.recipe.draw(self.parameters, cameras[i]).image for i in range(count)]
@@ -70,7 +70,7 @@ class Fit:
             drawing = self.recipe.draw(self.parameters, camera)
             on_rays = unproject_to_world(drawing.depth, camera)
             points.append(on_rays[drawing.alpha > LEAST_ALPHA])
-        return self.recipe.scene.frame.to_world(torch.cat(points)).cpu()
+        return self.recipe.scene.frame.points_outside(torch.cat(points)).cpu()
 
     @torch.no_grad()
     def gaussians(self) -> Gaussians:
@@ -81,7 +81,7 @@ class Fit:
         frame = self.recipe.scene.frame
         drawn = self.recipe.baked(self.parameters).gaussians()
         return Gaussians(
-            frame.to_world(drawn.means), drawn.quats, drawn.scales * frame.unit,
+            frame.points_outside(drawn.means), drawn.quats, drawn.scales * frame.unit,
             drawn.opacities, drawn.sh,
         ).to("cpu")  # fmt: skip
 

@@ -7,49 +7,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from extrap_train.depth import DepthMap, DepthSource
 from extrap_train.depth.depth_range import convergence_point
 from extrap_train.errors import InputError
+from extrap_train.geometry.world_frame import WorldFrame
 from extrap_train.views import Camera, View
 
 _SAME_PLACE = 1e-6
 """Cameras nearer to each other than this share of their distance from the origin coincide."""
 
 
-@dataclass(frozen=True)
-class SceneFrame:
-    """`x_world = unit · x + center`: the scene's centre is the origin, and 1 its extent.
+def scene_frame(cameras: Sequence[Camera]) -> WorldFrame:
+    """The frame that the input cameras alone define, with the scene's extent as its unit.
 
     The extent (3DGS: the radius of the cameras) is the mean distance of the cameras to what they
     look at: with three views the cameras' own spread says little of the scene's size.
-    """
-
-    center: Float[Tensor, "3"]
-    unit: float
-    """World units in one of the frame's."""
-
-    def camera(self, camera: Camera) -> Camera:
-        """A camera of the world in the frame; shared by all cameras of a batch."""
-        world_to_cam = camera.world_to_cam.clone()
-        moved = camera.world_to_cam[..., :3, :3] @ self.center.to(world_to_cam)
-        world_to_cam[..., :3, 3] = (world_to_cam[..., :3, 3] + moved) / self.unit
-        return replace(camera, world_to_cam=world_to_cam)
-
-    def view(self, view: View) -> View:
-        """A posed photograph of the world in the frame, its depth with it."""
-        depth = None if view.depth is None else view.depth / self.unit
-        return replace(view, camera=self.camera(view.camera), depth=depth)
-
-    def to_world(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Points of the frame in the world."""
-        return points * self.unit + self.center.to(points)
-
-
-def scene_frame(cameras: Sequence[Camera]) -> SceneFrame:
-    """The frame that the input cameras alone define.
 
     Centre: the point nearest to their optical axes. Cameras that look the same way have none:
     there the centre is their mean position and the unit the largest distance from it. InputError
@@ -62,8 +35,8 @@ def scene_frame(cameras: Sequence[Camera]) -> SceneFrame:
         raise InputError("all input views stand at one place; Gaussians need views from two")
     center = convergence_point(list(cameras))
     if center is None:
-        return SceneFrame(mean, spread)
-    return SceneFrame(center, float((positions - center).norm(dim=-1).mean()))
+        return WorldFrame(mean, spread)
+    return WorldFrame(center, float((positions - center).norm(dim=-1).mean()))
 
 
 _OVERSHOOT = 0.1
@@ -76,7 +49,7 @@ class TrainingScene:
 
     given: tuple[View, ...]
     views: tuple[View, ...]
-    frame: SceneFrame
+    frame: WorldFrame
     depth_source: DepthSource
     seed: int
     record: dict[str, str] = field(default_factory=dict)
@@ -98,7 +71,7 @@ def training_scene(views: Sequence[View], depth_source: DepthSource, seed: int) 
             name = view.name or f"input view {index}"
             raise InputError(f"{name}: {trouble}; mend the input")
     frame = scene_frame([view.camera for view in views])
-    moved = tuple(frame.view(view) for view in views)
+    moved = tuple(frame.view_inside(view) for view in views)
     return TrainingScene(tuple(views), moved, frame, depth_source, seed)
 
 

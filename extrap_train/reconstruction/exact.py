@@ -12,8 +12,8 @@ from extrap_train.data.queries import query_batch
 from extrap_train.data.synthetic import SyntheticScene, render, trace
 from extrap_train.depth import DepthMap, PointMaps, point_maps_of
 from extrap_train.diffusion.generator import GeneratedViews
+from extrap_train.geometry.world_frame import WorldFrame
 from extrap_train.reconstruction.completion import REFERENCES
-from extrap_train.reconstruction.inputs import WorldUnit
 from extrap_train.views import Camera, View
 
 
@@ -23,7 +23,7 @@ class ExactGenerator:
 
     scene: SyntheticScene
     image_size: int
-    unit: WorldUnit
+    unit: WorldFrame
     """Of the map that views and queries belong to."""
 
     @property
@@ -51,7 +51,7 @@ class ExactDepth:
     """A `DepthSource` that measures the scene; what a view's picture shows does not matter."""
 
     scene: SyntheticScene
-    unit: WorldUnit
+    unit: WorldFrame
     """Of the map that the views belong to."""
 
     @property

@@ -12,10 +12,10 @@ from plyfile import PlyData, PlyElement
 from extrap_train.data.images import to_eight_bits
 from extrap_train.geometry.colmap import colmap_from_world_to_cam
 from extrap_train.geometry.opengl import opengl_from_world_to_cam
+from extrap_train.geometry.world_frame import WorldFrame
 from extrap_train.pictures import picture_names, save_picture
 from extrap_train.reconstruction.cloud import PointCloud
 from extrap_train.reconstruction.global_map import GlobalMap, MapView
-from extrap_train.reconstruction.inputs import WorldUnit
 from extrap_train.store.atomic import write_atomic
 from extrap_train.views import Camera
 
@@ -38,7 +38,7 @@ def write_cloud(cloud: PointCloud, path: Path) -> None:
     write_atomic(path, content.getvalue())
 
 
-def write_views(known: GlobalMap, unit: WorldUnit, folder: Path) -> None:
+def write_views(known: GlobalMap, unit: WorldFrame, folder: Path) -> None:
     """Write every view's picture, depth and confidence under `views/`, and `transforms.json`.
 
     Depth is in units of `DEPTH_UNIT`.
@@ -53,7 +53,7 @@ def write_views(known: GlobalMap, unit: WorldUnit, folder: Path) -> None:
     write_atomic(folder / "transforms.json", (json.dumps(content, indent=1) + "\n").encode())
 
 
-def write_colmap(known: GlobalMap, unit: WorldUnit, cloud: PointCloud, folder: Path) -> None:
+def write_colmap(known: GlobalMap, unit: WorldFrame, cloud: PointCloud, folder: Path) -> None:
     """Write a COLMAP text model to `colmap/sparse/0`, with `colmap/images` leading to `views/`.
 
     `cloud` is in the photographs' world; its points have no tracks.

@@ -1,7 +1,7 @@
 """From photographs to the map's first views: which, in which unit, and whether they will do."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from extrap_train.geometry.viewpoints import (
     pairwise_angles,
     scene_center,
 )
+from extrap_train.geometry.world_frame import WorldFrame
 from extrap_train.reconstruction.continuation import continued_depth
 from extrap_train.reconstruction.new_view import CONTINUED_CONFIDENCE
 from extrap_train.views import Camera, View, stack_poses
@@ -37,46 +38,12 @@ WORKING_SIDE = 512
 """Photographs are not looked at more closely than this many pixels a side."""
 
 
-@dataclass(frozen=True)
-class WorldUnit:
-    """The map's world: the scene's centre at the origin, the cameras about 1 away from it.
-
-    No threshold then depends on the unit or the origin of the photographs' poses.
-    """
-
-    center: Float[Tensor, "3"]
-    """In the photographs' world."""
-    unit: float
-    """Length of 1 of the map, in the photographs' world."""
-
-    def inside(self, camera: Camera) -> Camera:
-        """A camera of the photographs' world in the map's."""
-        moved = camera.world_to_cam.double()
-        shift = moved[..., :3, :3] @ self.center.double() + moved[..., :3, 3]
-        return _with_translation(camera, shift / self.unit)
-
-    def outside(self, camera: Camera) -> Camera:
-        """A camera of the map's world in the photographs'."""
-        matrix = camera.world_to_cam.double()
-        shift = matrix[..., :3, 3] * self.unit - matrix[..., :3, :3] @ self.center.double()
-        return _with_translation(camera, shift)
-
-    def points_outside(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Points of the map's world in the photographs'."""
-        return (points.double() * self.unit + self.center.double()).to(points.dtype)
-
-
-def _with_translation(camera: Camera, translation: Float[Tensor, "*b 3"]) -> Camera:
-    matrix = camera.world_to_cam.clone()
-    matrix[..., :3, 3] = translation.to(matrix.dtype)
-    return replace(camera, world_to_cam=matrix)
-
-
-def world_unit(cameras: Camera) -> WorldUnit:
-    """Of the inputs' cameras, which must look at something in common."""
+def fit_world_frame(cameras: Camera) -> WorldFrame:
+    """The map's world: the inputs' cameras, which look at something in common, stand about 1 away
+    from its origin."""
     center = scene_center(cameras)
     distance = np.median(np.linalg.norm(camera_centers(cameras) - center, axis=1))
-    return WorldUnit(torch.from_numpy(center), float(distance))
+    return WorldFrame(torch.from_numpy(center), float(distance))
 
 
 def choose_frames(
@@ -169,7 +136,7 @@ def _check_lens(camera: Camera, name: str) -> None:
 
 
 def first_views(
-    photographs: Sequence[View], source: DepthSource, unit: WorldUnit, size: int
+    photographs: Sequence[View], source: DepthSource, unit: WorldFrame, size: int
 ) -> tuple[list[View], list[Float[Tensor, "s s"]]]:
     """The photographs as squares of `size` pixels in the map's world, with depth and confidence.
 
@@ -180,11 +147,7 @@ def first_views(
     squares = [
         photo.squared(min(side, photo.camera.height, photo.camera.width)) for photo in photographs
     ]
-    squares = [replace(view, camera=unit.inside(view.camera)) for view in squares]
-    scaled = [
-        view if view.depth is None else replace(view, depth=view.depth / unit.unit)
-        for view in squares
-    ]
+    scaled = [unit.view_inside(view) for view in squares]
     views, confidences = [], []
     for view, found in zip(scaled, source.depth_maps(scaled), strict=True):
         reliable = found.reliable()

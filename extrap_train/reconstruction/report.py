@@ -9,6 +9,7 @@ import torch
 
 from extrap_train.data.synthetic import SyntheticScene, surface_points
 from extrap_train.geometry.viewpoints import directions_from, scene_center
+from extrap_train.geometry.world_frame import WorldFrame
 from extrap_train.metrics import psnr
 from extrap_train.reconstruction.cloud import PointCloud
 from extrap_train.reconstruction.cloud_metrics import (
@@ -19,7 +20,6 @@ from extrap_train.reconstruction.cloud_metrics import (
 )
 from extrap_train.reconstruction.completion import Step
 from extrap_train.reconstruction.global_map import GENERATED, GlobalMap
-from extrap_train.reconstruction.inputs import WorldUnit
 from extrap_train.reconstruction.new_view import scene_size
 from extrap_train.reconstruction.prior import prior_of
 
@@ -29,7 +29,7 @@ SEEN_WITHIN_RAD = np.radians(20)
 
 
 def cloud_scores(
-    clouds: dict[str, PointCloud], scene: SyntheticScene, unit: WorldUnit
+    clouds: dict[str, PointCloud], scene: SyntheticScene, unit: WorldFrame
 ) -> dict[str, dict[str, float]]:
     """3-D scores of some clouds (in the map's world) of a synthetic scene, by name."""
     truth = surface_points(scene, TRUTH_POINTS)

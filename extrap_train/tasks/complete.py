@@ -25,17 +25,17 @@ from extrap_train.data.synthetic import SyntheticScene, build_scene
 from extrap_train.depth.sources import depth_source
 from extrap_train.device import advise_on_sampling_memory
 from extrap_train.errors import InputError
+from extrap_train.geometry.world_frame import WorldFrame
 from extrap_train.reconstruction.completion import Step, Workshop, complete, map_of_inputs
 from extrap_train.reconstruction.exact import ExactDepth, ExactGenerator
 from extrap_train.reconstruction.global_map import GlobalMap, MapView
 from extrap_train.reconstruction.growth import draw_plan
 from extrap_train.reconstruction.inputs import (
-    WorldUnit,
     check_cameras,
     choose_frames,
     first_views,
+    fit_world_frame,
     stand_where,
-    world_unit,
 )
 from extrap_train.reconstruction.map_files import (
     load_input_seconds,
@@ -86,7 +86,7 @@ class _Job:
     truth: SyntheticScene | None
     folder: Path
     inputs: list[int]
-    unit: WorldUnit
+    unit: WorldFrame
     used: UsedWeights | None
     """None where the views are rendered."""
 
@@ -129,7 +129,9 @@ def _job(config: TrainConfig) -> _Job:
     _check_category(config, sequence)
     folder = result_folder(config, f"{sequence.category}_{sequence.name}")
     used = UsedWeights.of(config) if _is_painted(config) else None
-    return _Job(config, sequence, truth, folder, inputs, world_unit(stack_poses(cameras)), used)
+    return _Job(
+        config, sequence, truth, folder, inputs, fit_world_frame(stack_poses(cameras)), used
+    )
 
 
 def _check_category(config: TrainConfig, sequence: FrameSequence) -> None:

@@ -17,6 +17,7 @@ from extrap_train.data.sequences import Frame, FrameSequence
 from extrap_train.data.synthetic import SyntheticScene
 from extrap_train.errors import InputError
 from extrap_train.gaussians.fit import Diverged
+from extrap_train.geometry.world_frame import WorldFrame
 from extrap_train.metrics import psnr, quantised, squeeze_lpips, ssim
 from extrap_train.pictures import colour_depth, contact_sheet, error_map, mark_holes
 from extrap_train.reconstruction.cloud import PointCloud, cloud_of
@@ -24,7 +25,7 @@ from extrap_train.reconstruction.completion import REFERENCES, Step, Workshop
 from extrap_train.reconstruction.export import write_cloud, write_colmap, write_views
 from extrap_train.reconstruction.global_map import GENERATED, GIVEN, GlobalMap, MapView
 from extrap_train.reconstruction.growth import draw_growth, draw_turntable
-from extrap_train.reconstruction.inputs import WorldUnit, stand_where
+from extrap_train.reconstruction.inputs import stand_where
 from extrap_train.reconstruction.prior import prior_of
 from extrap_train.reconstruction.report import (
     cloud_scores,
@@ -52,7 +53,7 @@ class Completed:
 
     known: GlobalMap
     steps: Sequence[Step]
-    unit: WorldUnit
+    unit: WorldFrame
     truth: SyntheticScene | None
     seconds: dict[str, float]
     """Of the inputs and the views, whichever run made them."""
@@ -235,7 +236,7 @@ def _compare_held_out(
 
 
 def _held_out(
-    given: Sequence[MapView], unit: WorldUnit, sequence: FrameSequence, known: Collection[str]
+    given: Sequence[MapView], unit: WorldFrame, sequence: FrameSequence, known: Collection[str]
 ) -> list[Frame]:
     """The frames that are not known, and were not taken from where an input was."""
     inputs = stack_cameras([unit.outside(view.camera) for view in given])

@@ -18,15 +18,15 @@ from extrap_train.gaussians.model import Gaussians
 from extrap_train.gaussians.options import BACKGROUNDS, GaussianOptions
 from extrap_train.gaussians.ply import read_comments, read_splats, write_splats
 from extrap_train.gaussians.rasterize import draw, rasterizer
+from extrap_train.geometry.world_frame import WorldFrame
 from extrap_train.metrics import psnr, quantised
 from extrap_train.pictures import contact_sheet, error_map
 from extrap_train.reconstruction.global_map import GlobalMap
-from extrap_train.reconstruction.inputs import WorldUnit
 from extrap_train.views import View
 
 
 def write_fitted_splats(
-    known: GlobalMap, unit: WorldUnit, options: SplatsConfig, seed: int, folder: Path
+    known: GlobalMap, unit: WorldFrame, options: SplatsConfig, seed: int, folder: Path
 ) -> dict[str, float]:
     """Fit 3DGS to all views of the map, in the photographs' world, from the views' own depth.
 
@@ -59,7 +59,7 @@ def write_fitted_splats(
     return {"gaussians": float(len(splats)), "psnr": score, "seconds": seconds}
 
 
-def _outside(view: View, unit: WorldUnit) -> View:
+def _outside(view: View, unit: WorldFrame) -> View:
     """A view of the map in the photographs' world."""
     assert view.depth is not None
     return replace(view, camera=unit.outside(view.camera), depth=view.depth * unit.unit)
@@ -83,7 +83,7 @@ def _is_marked(path: Path, mark: str) -> bool:
         return False
 
 
-def _inside(splats: Gaussians, unit: WorldUnit) -> Gaussians:
+def _inside(splats: Gaussians, unit: WorldFrame) -> Gaussians:
     """Gaussians of the photographs' world in the map's, whose unit suits the near plane."""
     means = (splats.means - unit.center.to(splats.means)) / unit.unit
     return replace(splats, means=means, scales=splats.scales / unit.unit)

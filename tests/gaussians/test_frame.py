@@ -15,7 +15,7 @@ def test_the_frame_puts_the_orbit_at_distance_one_around_the_origin():
     torch.testing.assert_close(frame.center, torch.zeros(3), atol=1e-5, rtol=0)
     assert frame.unit == pytest.approx(3.0, rel=1e-5)
     for azimuth in (0, 70, 123):
-        moved = frame.camera(orbit_camera(azimuth, distance=3.0))
+        moved = frame.inside(orbit_camera(azimuth, distance=3.0))
         assert float(moved.center.norm()) == pytest.approx(1.0, rel=1e-4)
 
 
@@ -25,8 +25,8 @@ def test_a_point_is_seen_at_the_same_pixel_in_any_unit(unit):
     frame = scene_frame(cameras)
     points = torch.tensor([[0.1, 0.2, -0.05], [-0.2, 0.0, 0.3]])
     for camera in cameras:
-        pixels, depth = project(frame.to_world(points), camera)
-        inside, normalised = project(points, frame.camera(camera))
+        pixels, depth = project(frame.points_outside(points), camera)
+        inside, normalised = project(points, frame.inside(camera))
         torch.testing.assert_close(pixels, inside, atol=1e-2, rtol=0)
         torch.testing.assert_close(depth / frame.unit, normalised, atol=1e-4, rtol=1e-4)
 

@@ -20,7 +20,7 @@ from extrap_train.diffusion.generator import GeneratedViews
 from extrap_train.reconstruction.cloud import cloud_of
 from extrap_train.reconstruction.completion import Workshop, complete, map_of_inputs
 from extrap_train.reconstruction.exact import ExactDepth, ExactGenerator
-from extrap_train.reconstruction.inputs import choose_frames, first_views, world_unit
+from extrap_train.reconstruction.inputs import choose_frames, first_views, fit_world_frame
 from extrap_train.reconstruction.planner import orbit_queries
 from extrap_train.reconstruction.report import cloud_scores
 from extrap_train.views import Camera, View, stack_poses
@@ -100,7 +100,7 @@ class _DepthOfThePicture:
 def _accuracy(spoil: Spoil, stubborn: bool, handling: ConfidenceConfig) -> dict[str, float]:
     sequence, scene = open_scene("synthetic:hydrant/0001"), build_scene("hydrant", 1, 0)
     frames = [sequence.frames[i] for i in choose_frames(sequence.frames, 3, [], "one_sided", 0)]
-    unit = world_unit(stack_poses([frame.camera for frame in frames]))
+    unit = fit_world_frame(stack_poses([frame.camera for frame in frames]))
     exact = ExactGenerator(scene, _SIZE, unit)
     measured = ExactDepth(scene, unit)
     views, confidences = first_views([f.load() for f in frames], measured, unit, _SIZE)

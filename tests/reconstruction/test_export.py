@@ -13,16 +13,16 @@ from plyfile import PlyData
 
 from extrap_train.data.transforms_json import read_transforms
 from extrap_train.geometry.cameras import unproject_to_world
+from extrap_train.geometry.world_frame import WorldFrame
 from extrap_train.reconstruction.cloud import cloud_of
 from extrap_train.reconstruction.export import write_cloud, write_colmap, write_views
 from extrap_train.reconstruction.global_map import GENERATED, GIVEN, GlobalMap, Origin
-from extrap_train.reconstruction.inputs import WorldUnit
 from extrap_train.views import View
 
 _SIZE = 40
 _RADIUS = 0.6
 _SCENE = scenes.Scene((scenes.sphere(_RADIUS),))
-_UNIT = WorldUnit(torch.tensor([3.0, -1.0, 0.5]), 2.5)
+_UNIT = WorldFrame(torch.tensor([3.0, -1.0, 0.5]), 2.5)
 _NAMES = [
     "IMG 003 (edited).jpg",
     "IMG_003__edited_.jpg",  # the same once cleaned

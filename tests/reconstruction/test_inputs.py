@@ -16,8 +16,8 @@ from extrap_train.reconstruction.inputs import (
     check_cameras,
     choose_frames,
     first_views,
+    fit_world_frame,
     stand_where,
-    world_unit,
 )
 from extrap_train.reconstruction.pose_check import check_poses
 from extrap_train.views import Camera, View, stack_cameras
@@ -101,7 +101,7 @@ def test_unit_and_origin_of_the_world_do_not_matter(unit):
     scaled = [replace(v, camera=scenes.scaled(v.camera, unit), depth=v.depth * unit) for v in views]
     found = []
     for group in (views, scaled):
-        world = world_unit(stack_cameras([v.camera for v in group]))
+        world = fit_world_frame(stack_cameras([v.camera for v in group]))
         inside, _ = first_views(group, DatasetDepth(), world, 32)
         found.append(inside)
         back = world.outside(inside[0].camera)
@@ -125,7 +125,7 @@ def test_depth_with_holes_over_half_the_picture_is_continued_with_low_confidence
         depth[:, ::2] = 0
         depth[:8] = 0
         views.append(View(scenes.PLANE.image(camera), camera, depth))
-    world = world_unit(stack_cameras([v.camera for v in views]))
+    world = fit_world_frame(stack_cameras([v.camera for v in views]))
     inside, confidences = first_views(views, DatasetDepth(), world, 48)
     for view, confidence in zip(inside, confidences, strict=True):
         truth = scenes.PLANE.depth(world.outside(view.camera)) / world.unit
@@ -136,7 +136,7 @@ def test_depth_with_holes_over_half_the_picture_is_continued_with_low_confidence
 
 def test_no_depth_at_all_is_refused():
     views = [View(scenes.PLANE.image(c), c, torch.zeros(48, 48)) for c in cameras(-30, 0, 30)]
-    world = world_unit(stack_cameras([v.camera for v in views]))
+    world = fit_world_frame(stack_cameras([v.camera for v in views]))
     with pytest.raises(InputError, match="no reliable depth in any photograph"):
         first_views(views, DatasetDepth(), world, 32)
 

@@ -9,12 +9,12 @@ import torch
 from extrap_train.config import SplatsConfig
 from extrap_train.gaussians.fit import Diverged
 from extrap_train.gaussians.ply import read_splats
+from extrap_train.geometry.world_frame import WorldFrame
 from extrap_train.reconstruction.global_map import GlobalMap, Origin
-from extrap_train.reconstruction.inputs import WorldUnit
 from extrap_train.tasks import splats as task
 from tests.benchmarks.analytic import view_at
 
-_UNIT = WorldUnit(torch.tensor([3.0, -2.0, 5.0]), 7.0)
+_UNIT = WorldFrame(torch.tensor([3.0, -2.0, 5.0]), 7.0)
 _OPTIONS = SplatsConfig(iterations=20, count=300)
 
 
