@@ -37,8 +37,9 @@ def test_two_views_are_no_orbit():
 
 def test_cameras_on_a_circle_are_found_where_they_were_put():
     circle = fit_circle(ring(even(7), elevation_deg=20))
-    azimuths, elevations, distances = np.radians([10, 100, 350]), np.radians([-5, 0, 40]), [1, 2, 3]
-    poses = torch.from_numpy(circle.poses(azimuths, elevations, np.array(distances)))
+    azimuths, elevations = np.radians([10, 100, 350]), np.radians([-5, 0, 40])
+    distances = np.array([1.0, 2.0, 3.0])
+    poses = torch.from_numpy(circle.poses(azimuths, elevations, distances))
     cameras = Camera(poses, torch.eye(3).double().expand(3, 3, 3), 8, 8)
     for found, given in zip(
         circle.locate(camera_centers(cameras)), (azimuths, elevations, distances), strict=True
