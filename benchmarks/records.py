@@ -13,7 +13,7 @@ from pydantic import AfterValidator, Field
 
 from benchmarks.protocol import Draw
 from extrap_train.config import MethodConfig, TableConfig
-from extrap_train.config.tree import MISSING
+from extrap_train.config.options import MISSING
 from extrap_train.errors import InputError
 from extrap_train.store.records import read_record
 

@@ -28,7 +28,7 @@ from extrap_train.config import (
     PrepConfig,
     SyntheticConfig,
     TrainConfig,
-    placed,
+    resolve_paths,
 )
 from extrap_train.data.co3d import read_category, require_category
 from extrap_train.data.co3d.set_lists import read_sequence_split
@@ -65,7 +65,7 @@ def prepare_category(
     that failed before are tried again. Paths are followed to where they lead, so that other
     spellings of one are the same preparation.
     """
-    data, depth, matcher = placed(data), placed(depth), placed(matcher)
+    data, depth, matcher = resolve_paths(data), resolve_paths(depth), resolve_paths(matcher)
     how = matcher if is_corrected(data, depth, prep) else None
     models = PrepModels(depth, how)
     models.check()  # before anything is rendered

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from extrap_train.cli import TRAIN, command
 from extrap_train.config import PAIR_TASKS, TrainConfig
-from extrap_train.store.outcome import Outcome
+from extrap_train.store import Outcome
 from extrap_train.tasks import task
 
 if TYPE_CHECKING:

@@ -27,7 +27,7 @@ from extrap_train.exits import ends_in_one_line
 from extrap_train.help_text import help_text
 from extrap_train.option_errors import explain
 from extrap_train.overrides import CommandLine
-from extrap_train.store.outcome import Outcome
+from extrap_train.store import Outcome
 from extrap_train.terminal import terminal
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT)

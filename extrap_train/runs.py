@@ -13,7 +13,7 @@ import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 
-from extrap_train.config import SceneOptions, SyntheticConfig, TrainConfig, dotted, placed
+from extrap_train.config import SceneOptions, SyntheticConfig, TrainConfig, dotted, resolve_paths
 from extrap_train.data.prepared import PreparedData
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import partial_path, write_atomic
@@ -134,7 +134,8 @@ def _all_options(config: TrainConfig) -> dict[str, Any]:
     """All options, with the sampler as it is used: what the model recommends is spelled out; paths
     as they lead from everywhere.
     """
-    return asdict(placed(config)) | {"sampler": asdict(config.sampler.over(config.model.sampler))}
+    sampler = config.sampler.over(config.model.sampler)
+    return asdict(resolve_paths(config)) | {"sampler": asdict(sampler)}
 
 
 def _digest(identity: dict[str, Any]) -> str:

@@ -24,10 +24,10 @@ from omegaconf import DictConfig
 
 from extrap_train.data.json_files import read_json
 from extrap_train.errors import InputError, did_you_mean
+from extrap_train.store import Outcome
 from extrap_train.store.atomic import file_lock, remove_leftovers, write_atomic
 from extrap_train.store.cache import require_same
 from extrap_train.store.manifest import MANIFEST, Manifest
-from extrap_train.store.outcome import Outcome
 from extrap_train.store.records import write_record
 from extrap_train.sweep_seeds import over_seeds
 

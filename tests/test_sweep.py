@@ -12,8 +12,8 @@ import yaml
 from extrap_train.__main__ import main
 from extrap_train.config import TrainConfig
 from extrap_train.errors import InputError
+from extrap_train.store import Outcome
 from extrap_train.store.atomic import file_lock
-from extrap_train.store.outcome import Outcome
 from extrap_train.sweep import add_row, compare_over_seeds, read_rows
 from extrap_train.sweep_seeds import over_seeds
 

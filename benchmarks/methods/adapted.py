@@ -42,7 +42,7 @@ class AdaptedDiffusion(Diffusion):
         views = [view.squared(model.config.warp_size) for view in views_with_depth(inputs)]
         options = LoraConfig(steps=self.lora_steps)
         pairs = adaptation_pairs(
-            views, model.config.told_references, options.virtual_references, inputs.seed
+            views, model.config.num_condition_views, options.virtual_references, inputs.seed
         )
         # One process of its own, also where a cluster runs the cell.
         alone = LightningEnvironment()

@@ -15,7 +15,14 @@ from extrap_train.config.benchmark import (
     ScoringConfig,
     TableConfig,
 )
-from extrap_train.config.checks import notes, required_file, validate, validate_model
+from extrap_train.config.checks import (
+    notes,
+    require_published,
+    required_file,
+    sampler_for,
+    validate,
+    validate_model,
+)
 from extrap_train.config.commands import PAIR_TASKS, TASKS, DataPrepConfig, TrainConfig
 from extrap_train.config.completion import CompletionConfig, ConfidenceConfig, SplatsConfig
 from extrap_train.config.data import (
@@ -50,71 +57,14 @@ from extrap_train.config.model import (
     UNetConfig,
     VaeConfig,
 )
-from extrap_train.config.options import Option, check_options, options_of
-from extrap_train.config.places import placed, placed_value
-from extrap_train.config.sampling import require_published, sampler_for
+from extrap_train.config.options import (
+    MISSING,
+    Option,
+    check_options,
+    dotted,
+    options_of,
+    resolve_path,
+    resolve_paths,
+)
 from extrap_train.config.scene import LoraConfig, SceneOptions
 from extrap_train.config.training import TrainerConfig, ValidationConfig
-from extrap_train.config.tree import MISSING, dotted
-
-__all__ = [
-    "CAPTURE_SOURCES",
-    "CATEGORIES",
-    "DRAWS",
-    "FAMILIES",
-    "LPIPS_NETS",
-    "MISSING",
-    "NEAREST_ALONE",
-    "PAIR_TASKS",
-    "TASKS",
-    "AlikedMatcherConfig",
-    "CapturesConfig",
-    "CategoryConfig",
-    "ClipConfig",
-    "Co3dConfig",
-    "CompletionConfig",
-    "ConfidenceConfig",
-    "DataConfig",
-    "DataPrepConfig",
-    "DatasetDepthConfig",
-    "DepthConfig",
-    "FlowMatcherConfig",
-    "LauncherConfig",
-    "LocalConfig",
-    "LoftrMatcherConfig",
-    "LoraConfig",
-    "Mast3rConfig",
-    "MatcherConfig",
-    "MethodConfig",
-    "ModelConfig",
-    "MonocularConfig",
-    "Option",
-    "PrepConfig",
-    "QuickConfig",
-    "RulesConfig",
-    "SamplerConfig",
-    "SamplerOptions",
-    "SceneOptions",
-    "ScoringConfig",
-    "SlurmConfig",
-    "SplatsConfig",
-    "StereoConfig",
-    "SyntheticConfig",
-    "TableConfig",
-    "TrainConfig",
-    "TrainerConfig",
-    "UNetConfig",
-    "VaeConfig",
-    "ValidationConfig",
-    "check_options",
-    "dotted",
-    "notes",
-    "options_of",
-    "placed",
-    "placed_value",
-    "require_published",
-    "required_file",
-    "sampler_for",
-    "validate",
-    "validate_model",
-]

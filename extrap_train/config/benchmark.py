@@ -4,8 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from extrap_train.config.launcher import SlurmConfig
-from extrap_train.config.options import option
-from extrap_train.config.tree import MISSING
+from extrap_train.config.options import MISSING, option
 
 CAPTURE_SOURCES = ("synthetic", "co3d", "reconfusion", "scenes")
 DRAWS = ("random", "spread", "one_sided", "given")

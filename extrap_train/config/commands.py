@@ -8,10 +8,9 @@ from extrap_train.config.depth import DepthConfig
 from extrap_train.config.launcher import LauncherConfig
 from extrap_train.config.matching import MatcherConfig
 from extrap_train.config.model import ModelConfig, SamplerOptions
-from extrap_train.config.options import option
+from extrap_train.config.options import MISSING, option
 from extrap_train.config.scene import SceneOptions
 from extrap_train.config.training import TrainerConfig, ValidationConfig
-from extrap_train.config.tree import MISSING
 
 TASKS = {
     "category": "prepare a category, train its model, and measure it on held-out sequences",

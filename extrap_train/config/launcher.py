@@ -2,8 +2,7 @@
 
 from dataclasses import dataclass
 
-from extrap_train.config.options import option
-from extrap_train.config.tree import MISSING
+from extrap_train.config.options import MISSING, option
 
 
 @dataclass

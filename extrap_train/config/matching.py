@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from extrap_train.config.options import option
-from extrap_train.config.tree import MISSING
+from extrap_train.config.options import MISSING, option
 
 
 @dataclass

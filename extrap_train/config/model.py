@@ -3,8 +3,7 @@
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from extrap_train.config.options import option, unset
-from extrap_train.config.tree import MISSING
+from extrap_train.config.options import MISSING, option, unset
 
 FAMILIES = ("zeronvs", "megascenes", "ours")
 """What a denoiser may be told about the query view; `extrap_train.diffusion.family` has each."""
@@ -190,6 +189,6 @@ class ModelConfig:
         return self.warp_scale * self.image_size
 
     @property
-    def told_references(self) -> int:
+    def num_condition_views(self) -> int:
         """`references`, and 1 for the families that are told of no more, whatever it says."""
         return 1 if self.family in NEAREST_ALONE else self.references

@@ -4,14 +4,19 @@ import copy
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import MISSING as NO_DEFAULT
-from dataclasses import Field, dataclass, field, fields, is_dataclass
+from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
 from functools import cache
+from pathlib import Path
 from types import UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from extrap_train.config.tree import MISSING, require_one_of
 from extrap_train.errors import InputError
 
+MISSING: Any = "???"  # OmegaConf's mark for "must be given"
+_PATHS = ("root", "checkpoint")
+_PATHS_OR_NAMES = ("model", "start")
+"""What is no path here is the name of weights in the package or in a cache of downloads."""
+Options = TypeVar("Options")
 _KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
 
 
@@ -142,3 +147,43 @@ def _default(each: "Field[Any]") -> Any:
     if each.default_factory is not NO_DEFAULT:
         return each.default_factory()
     return MISSING if each.default is NO_DEFAULT else each.default
+
+
+def dotted(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """A nested mapping as one of dotted keys."""
+    items: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            items |= dotted(value, f"{prefix}{key}.")
+        else:
+            items[prefix + key] = value
+    return items
+
+
+def require_one_of(name: str, value: str, known: tuple[str, ...]) -> None:
+    """InputError unless the option's value is one of the known words."""
+    if value not in known:
+        raise InputError(f"{name}={value} is unknown; known: {', '.join(known)}")
+
+
+def resolve_paths(options: Options) -> Options:
+    """The same options with paths that lead to where theirs do, whatever they went through.
+
+    `options` are a dataclass of the configuration tree; those below it are resolved, too.
+    """
+    tree: Any = options
+    changes: dict[str, Any] = {}
+    for each in fields(tree):
+        value = getattr(tree, each.name)
+        is_part = is_dataclass(value)
+        changes[each.name] = resolve_paths(value) if is_part else resolve_path(each.name, value)
+    return replace(tree, **changes)
+
+
+def resolve_path(name: str, value: Any) -> Any:
+    """The value of the option called `name` in its group; of a path, the one that it leads to."""
+    if not isinstance(value, str) or not value:
+        return value
+    if name in _PATHS or (name in _PATHS_OR_NAMES and Path(value).exists()):
+        return str(Path(value).resolve())
+    return value

@@ -96,7 +96,7 @@ class DiffusionGenerator:
         self, references: Sequence[View], queries: Camera, names: Sequence[str], seed: int
     ) -> GeneratedViews:
         config = self.model.config
-        size, most = config.warp_size, self.references or config.told_references
+        size, most = config.warp_size, self.references or config.num_condition_views
         device = next(self.model.parameters()).device
         # Geometry keeps its precision where the network runs in less.
         with torch.autocast(device.type, enabled=False):

@@ -58,7 +58,7 @@ def _zeronvs_pose(
         2 * torch.atan(query.width / (2 * query.intrinsics[:, 0, 0])),
         2 * torch.atan(query.height / (2 * query.intrinsics[:, 1, 1])),
     )
-    return _nineteen(relative, fov_rad)
+    return _pose_vector(relative, fov_rad)
 
 
 def megascenes_pose(
@@ -74,10 +74,10 @@ def megascenes_pose(
         relative = reference.world_to_cam @ query.cam_to_world
         relative[:, :3, 3] /= scale[:, None]
         diagonal = math.hypot(query.width, query.height)
-        return _nineteen(relative, 2 * torch.atan(diagonal / (2 * query.intrinsics[:, 0, 0])))
+        return _pose_vector(relative, 2 * torch.atan(diagonal / (2 * query.intrinsics[:, 0, 0])))
 
 
-def _nineteen(
+def _pose_vector(
     relative: Float[Tensor, "b 4 4"], fov_rad: Float[Tensor, " b"]
 ) -> Float[Tensor, "b 19"]:
     fov = torch.stack([fov_rad, fov_rad.sin(), fov_rad.cos()], -1)

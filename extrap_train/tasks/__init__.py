@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from extrap_train.store.outcome import Outcome
+from extrap_train.store import Outcome
 
 
 def task(name: str) -> Callable[..., Outcome | Path | None]:

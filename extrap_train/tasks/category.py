@@ -14,7 +14,7 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from rich.console import Console
 
-from extrap_train.config import TrainConfig, placed
+from extrap_train.config import TrainConfig, resolve_paths
 from extrap_train.data.module import PairModule
 from extrap_train.data.prepared import PreparedData
 from extrap_train.device import advise_on_training_memory, require_accelerator
@@ -43,9 +43,9 @@ from extrap_train.runs import (
     run_manifest,
     write_options,
 )
+from extrap_train.store import Outcome
 from extrap_train.store.cache import REMEDY, Conflict, claim
 from extrap_train.store.manifest import Manifest
-from extrap_train.store.outcome import Outcome
 from extrap_train.tasks.leakage import require_unseen
 from extrap_train.tasks.results import Results, draw_curve, draw_views, write_results
 from extrap_train.tasks.training_data import Prepare, data_module, validation_names
@@ -181,9 +181,8 @@ def quieten_lightning() -> None:
 
 def _model(config: TrainConfig) -> ExtrapolationModel:
     torch.manual_seed(config.seed)
-    model = use_channels_last(
-        initial_model(placed(config.model))
-    )  # says for good what it started from
+    start = resolve_paths(config.model)  # the saved model says for good what it started from
+    model = use_channels_last(initial_model(start))
     if config.trainer.gradient_checkpointing:
         model.unet.enable_gradient_checkpointing()
     if config.trainer.compile:

@@ -48,12 +48,15 @@ from extrap_train.reconstruction.map_files import (
 from extrap_train.reconstruction.planner import Query, expected_order, orbit_queries
 from extrap_train.reconstruction.pose_check import check_poses
 from extrap_train.reconstruction.viewer import CloudViewer
+from extrap_train.store import Outcome
 from extrap_train.store.cache import claim
-from extrap_train.store.outcome import Outcome
 from extrap_train.tasks.completed import Completed, write_completed
-from extrap_train.tasks.scene_content import scene_manifest
-from extrap_train.tasks.scene_folder import require_space, result_folder
-from extrap_train.tasks.scene_inputs import required_scene
+from extrap_train.tasks.scene_inputs import (
+    require_space,
+    required_scene,
+    result_folder,
+    scene_manifest,
+)
 from extrap_train.tasks.scene_model import (
     UsedWeights,
     device_of,

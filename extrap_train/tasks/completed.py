@@ -36,7 +36,7 @@ from extrap_train.reconstruction.report import (
 )
 from extrap_train.runs import provenance
 from extrap_train.store.atomic import write_atomic
-from extrap_train.tasks.scene_content import photograph_digests
+from extrap_train.tasks.scene_inputs import photograph_digests
 from extrap_train.tasks.scene_model import UsedWeights, frames_learnt
 from extrap_train.tasks.splats import write_fitted_splats
 from extrap_train.views import Camera, stack_cameras

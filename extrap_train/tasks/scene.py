@@ -32,21 +32,24 @@ from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError
 from extrap_train.metrics import Distance, lpips_or_reason
 from extrap_train.pictures import contact_sheet, curve, error_map, mark_holes
+from extrap_train.store import Outcome
 from extrap_train.store.atomic import write_atomic
 from extrap_train.store.cache import Claim, claim
 from extrap_train.store.digests import file_digest
-from extrap_train.store.outcome import Outcome
 from extrap_train.store.records import read_record
 from extrap_train.tasks.results import without_nan
-from extrap_train.tasks.scene_content import photograph_digests, scene_manifest
-from extrap_train.tasks.scene_folder import nothing_kept, require_space, result_folder
 from extrap_train.tasks.scene_inputs import (
     SceneInputs,
     input_frames,
     label_of,
+    nothing_kept,
     open_inputs,
     open_sequence,
+    photograph_digests,
+    require_space,
     required_scene,
+    result_folder,
+    scene_manifest,
 )
 from extrap_train.tasks.scene_model import (
     UsedWeights,
@@ -99,7 +102,7 @@ def _run(
     model = trained_model(config).to(device_of(config))
     inputs = open_inputs(config, sequence, model.config.warp_size)
     pairs = adaptation_pairs(
-        inputs.views, model.config.told_references, config.lora.virtual_references, config.seed
+        inputs.views, model.config.num_condition_views, config.lora.virtual_references, config.seed
     )
     sampler = sampler_for(config.sampler, model.config)
     targets = _targets(config, inputs, model)

@@ -1,15 +1,27 @@
-"""What the tasks about one scene start from: its views with depth, and its other frames."""
+"""What the tasks about one scene start from: its views, their digests, and the result's folder."""
 
-from dataclasses import dataclass, replace
+import hashlib
+import json
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
 
-from extrap_train.config import SyntheticConfig, TrainConfig
+from extrap_train.config import SyntheticConfig, TrainConfig, dotted
 from extrap_train.data.photographs import CATEGORY
-from extrap_train.data.scene import open_scene
+from extrap_train.data.scene import SYNTHETIC_SCHEME, open_scene, scene_address
 from extrap_train.data.scene_views import input_views, select_input_frames
 from extrap_train.data.sequences import Frame, FrameSequence
-from extrap_train.depth.sources import depth_source
+from extrap_train.depth.sources import depth_source, weight_files
 from extrap_train.errors import InputError
+from extrap_train.runs import given_name
+from extrap_train.store.digests import file_digest
+from extrap_train.store.manifest import Manifest
 from extrap_train.views import View
+
+_MIB = 2**20
 
 
 @dataclass(frozen=True)
@@ -73,3 +85,84 @@ def open_inputs(
     names = {view.name for view in views}
     others = [frame for frame in sequence.frames if frame.name not in names]
     return SceneInputs(views, others)
+
+
+def frame_digest(frame: Frame) -> str:
+    """SHA-256 of a frame's camera, of how it is read, and of its photograph, mask and depth.
+
+    A frame without files is rendered: that follows from the options and its name.
+    """
+    camera, rendered = frame.camera, [] if frame.files else [frame.name]
+    about = [camera.height, camera.width, frame.reading, *rendered]
+    digest = hashlib.sha256(json.dumps(about).encode())
+    for tensor in (camera.world_to_cam, camera.intrinsics):
+        digest.update(tensor.numpy(force=True).tobytes())
+    for file in frame.files:
+        digest.update((file_digest(file) if file.exists() else "missing").encode())
+    return digest.hexdigest()
+
+
+def photograph_digests(frames: Iterable[Frame]) -> dict[str, str]:
+    """The frames' digests by their names."""
+    return {frame.name: frame_digest(frame) for frame in frames}
+
+
+def scene_manifest(
+    config: TrainConfig,
+    frames: Iterable[Frame],
+    weights: Mapping[str, str],
+    options: Mapping[str, Any],
+) -> Manifest:
+    """What a task's result about a scene is made from.
+
+    `frames` are those that it reads, `weights` digests of what paints it, `options` the task's own.
+    """
+    scene = required_scene(config)
+    made = isinstance(config.data, SyntheticConfig) and scene.startswith(SYNTHETIC_SCHEME)
+    of_capture = ("frames", "image_size", "seed") if made else ()
+    common = {
+        "scene": scene_address(scene),
+        "data": {name: getattr(config.data, name) for name in of_capture},
+        "inputs": config.inputs,
+        "input_frames": config.input_frames,
+        "depth": asdict(config.depth),
+        "sampler": asdict(config.sampler),
+        "trainer.precision": config.trainer.precision,
+        "seed": config.seed,
+    }
+    depth_files = [path for path in weight_files(config.depth) if path.is_file()]
+    return Manifest.of(
+        dotted(common) | dict(options),
+        {
+            **weights,
+            **{f"weights of depth ({path.name})": file_digest(path) for path in depth_files},
+            **{f"photograph {name}": d for name, d in photograph_digests(frames).items()},
+        },
+    )
+
+
+def result_folder(config: TrainConfig, label: str) -> Path:
+    """Where a task's result about a scene lies: called like the scene, or as `run` says."""
+    return Path(config.output) / config.task / (given_name(config) or label)
+
+
+@contextmanager
+def nothing_kept() -> Iterator[None]:
+    """Say on Ctrl-C that the block, whose result appears at its end, leaves nothing."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(
+            "nothing was changed; the same command starts from the beginning"
+        ) from None
+
+
+def require_space(folder: Path, needed: int) -> None:
+    """InputError if the disk that a folder will lie on has less than `needed` bytes left."""
+    place = next(path for path in (folder, *folder.resolve().parents) if path.exists())
+    free = shutil.disk_usage(place).free
+    if free < needed:
+        raise InputError(
+            f"{folder}: no space left on the device ({free / _MIB:.1f} MiB free, about "
+            f"{needed / _MIB:.1f} MiB needed); free some or choose another output="
+        )

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from hydra.core.hydra_config import HydraConfig
 from lightning.fabric import Fabric
 
 from extrap_train.config import ModelConfig, TrainConfig, dotted, sampler_for
@@ -26,11 +27,12 @@ from extrap_train.errors import InputError
 from extrap_train.runs import RunFolder, newest_run
 from extrap_train.store.digests import file_digest, folder_digest
 from extrap_train.store.records import read_record
-from extrap_train.tasks.saved_model import require_as_said, require_described
-from extrap_train.tasks.scene_content import frame_digest
-from extrap_train.tasks.scene_inputs import required_scene
+from extrap_train.tasks.scene_inputs import frame_digest, required_scene
 from extrap_train.terminal import terminal
 from extrap_train.views import Camera, View
+
+_OF_TRAINING = ("name", "start", "learning_rate", "projection_rate", "weight_decay")
+"""Say nothing of what a trained model is."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +118,7 @@ def model_of(config: TrainConfig, weights: str) -> ExtrapolationModel:
     folder = _folder_of(weights)
     if not is_own(folder):
         return open_model(weights, config.adapter, config.model)
-    require_as_said(saved_config(folder), config.model, folder)
+    require_saved_options(saved_config(folder), config.model, folder)
     return open_model(weights, config.adapter)
 
 
@@ -174,7 +176,7 @@ def open_model(
     path = _folder_of(weights)
     if is_own(path):
         if config is not None:
-            require_described(saved_config(path), config, path)
+            require_saved_model(saved_config(path), config, path)
         model = load_model(path)
     elif config is not None:
         model = published_model(weights, config)
@@ -218,3 +220,52 @@ def generate_views(
     """The generator's views; InputError that says which option to change where memory ends."""
     with advise_on_sampling_memory(config.painted_at_once, config.trainer):
         return generator.generate(views, cameras, names, config.seed)
+
+
+def require_saved_options(saved: ModelConfig, asked: ModelConfig, folder: Path) -> None:
+    """InputError for the first `model` option of the command line that the saved model contradicts.
+
+    What the command line leaves out, `asked` has by default, and the saved model as it is. Of
+    `model=NAME` the family must be the model's.
+    """
+    said = [name for name in _cli_overrides() if name != "model.name"]  # names its runs' folder
+    names = [n for n in _flat(asked) if any(f"{n}.".startswith(f"{option}.") for option in said)]
+    _require(saved, asked, names, folder)
+
+
+def require_saved_model(saved: ModelConfig, described: ModelConfig, folder: Path) -> None:
+    """InputError where a description that was given of a saved model is another's."""
+    left_out = [f"model.{name}" for name in _OF_TRAINING]
+    _require(saved, described, [name for name in _flat(described) if name not in left_out], folder)
+
+
+def _require(saved: ModelConfig, asked: ModelConfig, names: Iterable[str], folder: Path) -> None:
+    found, wanted = _flat(saved), _flat(asked)
+    for name in names:
+        if wanted[name] != (is_so := found.get(name)):
+            remedy = "remove this option, or give weights= that were trained with it"
+            if name.startswith("model.sampler."):
+                remedy = f"give {name.removeprefix('model.')}= instead"
+            if name == "model.image_size":
+                remedy += (
+                    f" (task=category {name}={asked.image_size} prep.image_size={asked.warp_size})"
+                )
+            raise InputError(
+                f"{name}={wanted[name]}: the weights {folder} fix {name}={is_so}; {remedy}"
+            )
+
+
+def _cli_overrides() -> list[str]:
+    """Options under `model` that the command line sets, and the family where it chooses a model;
+    none where no command line was read.
+    """
+    if not HydraConfig.initialized():
+        return []
+    words = HydraConfig.get().overrides.task
+    names = [word.partition("=")[0].lstrip("+~") for word in words]
+    said = [name for name in names if name.startswith("model.")]
+    return said + (["model.family"] if "model" in names else [])
+
+
+def _flat(model: ModelConfig) -> dict[str, Any]:
+    return dotted({"model": asdict(model)})

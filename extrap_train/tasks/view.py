@@ -24,14 +24,17 @@ from extrap_train.metrics import psnr, quantised
 from extrap_train.pictures import contact_sheet, film, mark_holes, picture_names, save_picture
 from extrap_train.store.cache import claim
 from extrap_train.store.records import write_record
-from extrap_train.tasks.scene_content import photograph_digests, scene_manifest
-from extrap_train.tasks.scene_folder import nothing_kept, require_space, result_folder
 from extrap_train.tasks.scene_inputs import (
     SceneInputs,
     input_frames,
     label_of,
+    nothing_kept,
     open_inputs,
     open_sequence,
+    photograph_digests,
+    require_space,
+    result_folder,
+    scene_manifest,
 )
 from extrap_train.tasks.scene_model import (
     UsedWeights,

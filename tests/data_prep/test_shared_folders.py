@@ -17,7 +17,7 @@ from extrap_train.config import (
     MonocularConfig,
     PrepConfig,
     SyntheticConfig,
-    placed,
+    resolve_paths,
 )
 from extrap_train.data.frame_files import frames_folder, pairs_folder
 from extrap_train.data.prepared import PreparedData
@@ -130,10 +130,10 @@ def test_weights_are_the_same_however_their_path_is_spelt(
         )
         for folder in (Path(), tmp_path)
     )
-    assert placed(spelt) == whole == placed(whole)
+    assert resolve_paths(spelt) == whole == resolve_paths(whole)
     named = MonocularConfig(matcher=FlowMatcherConfig())
-    assert placed(named) == named
-    assert placed(SyntheticConfig()) == SyntheticConfig()
+    assert resolve_paths(named) == named
+    assert resolve_paths(SyntheticConfig()) == SyntheticConfig()
 
 
 def test_a_changed_option_redoes_only_what_depends_on_it(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from extrap_train.data.scene import open_scene
-from extrap_train.tasks.scene_content import photograph_digests
+from extrap_train.tasks.scene_inputs import photograph_digests
 
 _NAMES = ["0.png", "1.png", "2.png"]
 

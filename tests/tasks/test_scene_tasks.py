@@ -19,7 +19,7 @@ from extrap_train.diffusion.checkpoint import load_model, save_model
 from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.diffusion.lora import AdapterOrigin, add_adapter, save_adapter
 from extrap_train.pictures import picture_names
-from extrap_train.tasks.scene_content import frame_digest
+from extrap_train.tasks.scene_inputs import frame_digest
 
 
 def test_a_walk_around_the_scene_is_pictures_and_films(command, weights, tmp_path) -> None:

@@ -37,7 +37,7 @@ def _write_sparse(file: Path, shapes: dict[str, list[int]]) -> None:
 
 @pytest.mark.parametrize("model", ["zeronvs", "megascenes"])
 def test_one_reference_is_loaded_where_one_is_told(model: str) -> None:
-    assert configured(model).references == configured(model).told_references == 1
+    assert configured(model).references == configured(model).num_condition_views == 1
 
 
 @pytest.mark.parametrize(
