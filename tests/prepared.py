@@ -1,6 +1,6 @@
 """Captures prepared as a download's are."""
 
-from collections.abc import FrameSequence as Some
+from collections.abc import Sequence as Some
 from pathlib import Path
 
 from data_prep.preparation import prepare
