@@ -7,9 +7,14 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor, nn
 
-from benchmarks.methods.gaussian_method import GaussianMethod, monocular_source, prior_depths
+from benchmarks.methods.gaussian_method import (
+    MONOCULAR,
+    GaussianMethod,
+    monocular_source,
+    prior_depths,
+)
+from extrap_train.config.options import option
 from extrap_train.errors import InputError
-from extrap_train.gaussians.checks import check_range, check_word
 from extrap_train.gaussians.density import remove
 from extrap_train.gaussians.init import nearest_expected
 from extrap_train.gaussians.losses import edge_aware_smoothness, filled, patch_depth_loss
@@ -42,49 +47,56 @@ class DnGaussian(GaussianMethod):
     prune_opacity: float = 0.01
     reset_every: int = 0
 
-    monocular: str = "surrogate"
-    """Where monocular depth comes from: `surrogate` or `depth_source`."""
-    hard_opacity: float = 0.95
-    soft_from: int = 1000
-    smooth_from: int = 3000
-    local_weight: float = 0.1
-    global_weight: float = 1.0
-    smooth_weight: float = 0.0
-    """Of edge-aware smoothness. Published: 0.1 for LLFF, none for others."""
-    depth_tolerance: float = 0.01
-    patch_range: tuple[int, int] = (5, 17)
-    """Least and greatest side of a patch in pixels; each term draws its own."""
-    shape_weight: float = 0.0
-    """Of round, of small, and of either opaque or transparent Gaussians. Published: none for
-    Blender, 0.002, 0.001 and 0.001 for LLFF.
-    """
-    scale_weight: float = 0.0
-    opacity_weight: float = 0.0
-    clear_every: int = 25
-    """Iterations after which Gaussians right before a camera, and unseen ones, are removed: patches
-    know no absolute depth, and a shell there satisfies them all.
-    """
+    monocular: str = option(
+        "surrogate",
+        "monocular depth: the depth source under an unknown affine map, or as it is",
+        known=MONOCULAR,
+    )
+    hard_opacity: float = option(0.95, "opacity in hard depth steps", low=0, high=1)
+    soft_from: int = option(1000, "iteration from which opacities follow depth", low=0)
+    smooth_from: int = option(3000, "iteration from which depth is smoothed", low=0)
+    local_weight: float = option(0.1, "weight of depth normalised by the patch", low=0)
+    global_weight: float = option(1.0, "weight of depth normalised by the image", low=0)
+    smooth_weight: float = option(
+        0.0, "weight of edge-aware smoothness; published: 0.1 for LLFF, none for others", low=0
+    )
+    depth_tolerance: float = option(0.01, "smaller differences of depth are let be", low=0)
+    patch_range: tuple[int, int] = option(
+        (5, 17), "smallest and largest side of a patch; each term draws its own", unit="px", low=2
+    )
+    shape_weight: float = option(
+        0.0, "weight of round Gaussians; published: none for Blender, 0.002 for LLFF", low=0
+    )
+    scale_weight: float = option(
+        0.0, "weight of small Gaussians; published: none for Blender, 0.001 for LLFF", low=0
+    )
+    opacity_weight: float = option(
+        0.0, "weight of opacities near 0 or 1; published: none for Blender, 0.001 for LLFF", low=0
+    )
+    clear_every: int = option(
+        25,
+        "iterations after which Gaussians right before a camera, and unseen ones, are removed: "
+        "patches know no absolute depth, and a shell there satisfies them all",
+        low=0,
+    )
 
-    color: str = "neural"
-    """`neural` (hash grid and networks) or `sh` (spherical harmonics)."""
-    hash_levels: int = 16
-    hash_log2_size: int = 19
-    hash_coarsest: int = 16
-    hash_finest: int = 512
-    hash_bound: float = 3.0
-    """Half the side of the cube that the grid covers, in extents."""
-    grid_rate: float = 5e-3
-    network_rate: float = 5e-4
+    color: str = option(
+        "neural", "hash grid and networks, or spherical harmonics", known=("neural", "sh")
+    )
+    hash_levels: int = option(16, "levels of the hash grid", low=2, high=32)
+    hash_log2_size: int = option(19, "entries of a level's table, as a power of 2", low=1, high=30)
+    hash_coarsest: int = option(16, "cells along the coarsest level", low=1)
+    hash_finest: int = option(512, "cells per extent along the finest level", low=1)
+    hash_bound: float = option(3.0, "half the side of the grid's cube, in extents", low=0.001)
+    grid_rate: float = option(5e-3, "learning rate of the hash grid", low=0)
+    network_rate: float = option(5e-4, "learning rate of the networks", low=0)
 
     def __post_init__(self) -> None:
         """InputError for the first option that cannot be meant."""
         super().__post_init__()
-        check_word("color", self.color, ("neural", "sh"))
         least, greatest = self.patch_range
-        check_range("patch_range[0]", least, 2)
-        check_range("patch_range[1]", greatest, least)
-        check_range("hash_levels", self.hash_levels, 2)
-        check_range("hash_log2_size", self.hash_log2_size, 1, 30)
+        if greatest < least:
+            raise InputError(f"patch_range={self.patch_range}: smallest first")
 
     def recipe(self, scene: TrainingScene) -> Recipe:
         """Three optimiser steps an iteration."""
@@ -230,8 +242,6 @@ class HashGrid(nn.Module):
         self, levels: int, log2_size: int, coarsest: int, finest: int, bound: float
     ) -> None:
         super().__init__()
-        if levels < 2:
-            raise InputError(f"hash_levels={levels}: must be at least 2")
         growth = (finest / coarsest) ** (1 / (levels - 1))
         cells = [int(coarsest * growth**level) for level in range(levels)]
         self.cells = nn.Buffer(torch.tensor(cells, dtype=torch.float32))

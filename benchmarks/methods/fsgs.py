@@ -9,7 +9,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from benchmarks.methods.gaussian_method import GaussianMethod, monocular_source, prior_depths
+from benchmarks.methods.gaussian_method import (
+    MONOCULAR,
+    GaussianMethod,
+    monocular_source,
+    prior_depths,
+)
+from extrap_train.config.options import option
 from extrap_train.errors import InputError
 from extrap_train.gaussians.init import nearest_neighbours
 from extrap_train.gaussians.losses import pearson_depth_loss
@@ -35,24 +41,33 @@ class Fsgs(GaussianMethod):
     reset_first: int = 2001
     reset_opacity: float = 0.05
 
-    monocular: str = "surrogate"
-    """Where monocular depth comes from: `surrogate` or `depth_source`."""
-    pairing: Pairing = "paper"
-    """Which ends an unpooled edge joins: the paper's, or those of the released code's mistake."""
-    unpool_until: int = 2000
-    unpool_proximity: float = 0.01
-    """Least mean squared distance to three neighbours; in squared extents. Published: 5 in the
-    squared units of LLFF's scenes, which is above anything in a scene of extent 1.
-    """
-    unpool_scale: float = 0.05
-    """Least scale of a source, in extents. Published: 1 extent of LLFF's forward-facing rigs."""
-    depth_weight: float = 0.05
-    late_depth_weight: float = 0.001
-    late_from: int = 9500
-    pseudo_from: int = 2000
-    pseudo_every: int = 10
-    pseudo_ramp: int = 500
-    pseudo_weight: float = 0.5
+    monocular: str = option(
+        "surrogate",
+        "monocular depth: the depth source under an unknown affine map, or as it is",
+        known=MONOCULAR,
+    )
+    pairing: Pairing = option(
+        "paper",
+        "ends of an unpooled edge: the paper's, or those of the released code's mistake",
+        known=("paper", "released"),
+    )
+    unpool_until: int = option(2000, "last iteration with unpooling", low=0)
+    unpool_proximity: float = option(
+        0.01,
+        "least mean squared distance to three neighbours, in squared extents (published: 5 in "
+        "LLFF's squared units, which is above anything in a scene of extent 1)",
+        low=0,
+    )
+    unpool_scale: float = option(
+        0.05, "least scale of a source (published: 1 extent of LLFF's forward-facing rigs)", low=0
+    )
+    depth_weight: float = option(0.05, "weight of the depth correlation", low=0)
+    late_depth_weight: float = option(0.001, "the same from late_from on", low=0)
+    late_from: int = option(9500, "iteration from which there are no pseudo views", low=0)
+    pseudo_from: int = option(2000, "iteration from which there are pseudo views", low=0)
+    pseudo_every: int = option(10, "iterations between two pseudo views", low=1)
+    pseudo_ramp: int = option(500, "iterations over which their weight grows", low=0)
+    pseudo_weight: float = option(0.5, "weight of their depth correlation", low=0)
 
     def recipe(self, scene: TrainingScene) -> Recipe:
         """3DGS's with three additions."""

@@ -12,12 +12,14 @@ from torch import Tensor
 from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis, photographs_used
 from extrap_train.depth import DepthSource
 from extrap_train.depth.surrogate import AffineSurrogate
-from extrap_train.errors import InputError
 from extrap_train.gaussians.fit import Fit, fit
 from extrap_train.gaussians.init import Points, parameters_from_points
 from extrap_train.gaussians.options import GaussianOptions
 from extrap_train.gaussians.recipe import Recipe
 from extrap_train.gaussians.scene import TrainingScene, training_scene
+
+MONOCULAR = ("surrogate", "depth_source")
+"""Known values of a method's option `monocular`."""
 
 
 @dataclass(frozen=True)
@@ -68,15 +70,11 @@ def monocular_source(scene: TrainingScene, name: str) -> DepthSource:
 
     The second is for benchmarks whose depth source is a monocular network. The record says which.
     """
-    match name:
-        case "surrogate":
-            scene.record["monocular"] = "surrogate: the depth source under an unknown affine map"
-            return AffineSurrogate(scene.depth_source, scene.seed)
-        case "depth_source":
-            scene.record["monocular"] = "the depth source"
-            return scene.depth_source
-        case _:
-            raise InputError(f"monocular={name} is unknown; known: surrogate, depth_source")
+    if name == "depth_source":
+        scene.record["monocular"] = "the depth source"
+        return scene.depth_source
+    scene.record["monocular"] = "surrogate: the depth source under an unknown affine map"
+    return AffineSurrogate(scene.depth_source, scene.seed)
 
 
 def prior_depths(

@@ -1,6 +1,6 @@
 """InstantSplat (Fan et al., 2024): a dense start from depth, poses refined with the scene."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from benchmarks.methods.gaussian_method import GaussianMethod
+from extrap_train.config.options import option
 from extrap_train.depth import DepthMap
 from extrap_train.gaussians.density import rotation_matrices
 from extrap_train.gaussians.init import Points, joined, pixel_points
@@ -37,13 +38,12 @@ class InstantSplat(GaussianMethod):
     densify_until: int = 0
     reset_every: int = 0
 
-    covisibility: float = 0.01
-    """Depths nearer than this share of the view's range are the same surface; 0: keep all."""
-    confidence_rates: bool = True
-    """Whether unsure points move faster."""
-    pose_rate: float = 1e-4
-    """Of the input poses' corrections, to `pose_rate_final`; 0: the poses stay as given."""
-    pose_rate_final: float = 1e-6
+    covisibility: float = option(
+        0.01, "share of a view's depth range within which surfaces are the same; 0: keep all", low=0
+    )
+    confidence_rates: bool = option(True, "whether unsure points move faster")
+    pose_rate: float = option(1e-4, "learning rate of the input poses; 0: they stay", low=0)
+    pose_rate_final: float = option(1e-6, "the same at the end", low=0)
 
     def recipe(self, scene: TrainingScene) -> Recipe:
         """3DGS's loop without its growth."""
@@ -192,41 +192,3 @@ def similarity_between(given: Sequence[Camera], refined: Sequence[Camera]) -> Si
     a, b = source - source.mean(0), target - target.mean(0)
     scale = float((a * b).sum() / a.square().sum().clamp_min(1e-20)) if a.any() else 1.0
     return Similarity(rotation, target.mean(0) - scale * source.mean(0), scale)
-
-
-def aligned_to_photograph(
-    render: Callable[[Camera], Float[Tensor, "3 h w"]],
-    camera: Camera,
-    photograph: Float[Tensor, "3 h w"],
-    steps: int = 500,
-    rates: tuple[float, float] = (1e-3, 3e-3),
-) -> Camera:
-    """The pose near `camera` from which the scene looks most like the photograph.
-
-    InstantSplat's evaluation does this with the *test* photograph (rates of rotation and
-    translation, L1 where something is drawn, cosine decay, best step kept): a number made so must
-    be marked, and no method gets one through the benchmark's protocol.
-    """
-    corrections = PoseCorrections(1).to(camera.world_to_cam.device)
-    groups = [
-        {"params": [parameter], "lr": rate}
-        for parameter, rate in zip(
-            (corrections.quats, corrections.translations), rates, strict=True
-        )
-    ]
-    adam = torch.optim.Adam(groups, weight_decay=1e-4)
-    decay = torch.optim.lr_scheduler.CosineAnnealingLR(adam, steps, eta_min=1e-4)
-    best, best_camera = float("inf"), camera
-    for _ in range(steps):
-        moved = corrections.corrected(camera, 0)
-        image = render(moved)
-        drawn = (image.detach() > 0).any(0)
-        loss = ((image - photograph).abs().mean(0) * drawn).sum() / drawn.sum().clamp_min(1)
-        if float(loss) < best:
-            best = float(loss)
-            best_camera = replace(moved, world_to_cam=moved.world_to_cam.detach())
-        adam.zero_grad()
-        loss.backward()
-        adam.step()
-        decay.step()
-    return best_camera

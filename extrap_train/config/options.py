@@ -128,8 +128,18 @@ def _walk(tree: type, prefix: str) -> Iterator[Option]:
             continue
         is_list = get_origin(hint) is list
         kind = get_args(hint)[0] if is_list else get_origin(hint) or hint
-        declared = each.metadata.get("option", Declared())
+        declared = _declared(tree, each.name)
         yield Option(name, kind, is_list, may_be_null, _default(each), declared)
+
+
+def _declared(tree: type, name: str) -> Declared:
+    """A subclass may give an inherited option another default without declaring it again."""
+    for owner in tree.__mro__:
+        own = vars(owner).get("__dataclass_fields__", {}).get(name)
+        if own is not None and "option" in own.metadata:
+            found: Declared = own.metadata["option"]
+            return found
+    return Declared()
 
 
 def _plain(number: int | float) -> str:

@@ -11,6 +11,7 @@ from torch.nn import functional
 from extrap_train.gaussians.model import GaussianParameters, from_tensors
 from extrap_train.gaussians.optimiser import GaussianOptimiser
 from extrap_train.gaussians.options import GaussianOptions
+from extrap_train.gaussians.rasterize import Drawing
 
 SPLIT_SHRINK = 1.6
 """Each half of a split Gaussian is this much smaller: 0.8 times their number, 2."""
@@ -41,6 +42,12 @@ class GrowthStatistics:
         ndc = gradient * gradient.new_tensor([width / 2, height / 2])
         self.gradient += torch.where(seen, ndc.norm(dim=-1), 0)
         self.visits += seen
+
+    def add_drawing(self, drawing: Drawing) -> None:
+        """The same from a drawing whose loss has been differentiated."""
+        if drawing.centers.grad is not None:
+            radii = drawing.radii[0].amax(-1).float()
+            self.add(drawing.centers.grad[0], radii, *drawing.depth.shape)
 
     def follow(self, kept: Bool[Tensor, " n"], added: int) -> None:
         """The rows that are left, and new ones behind them that nothing has shown yet."""

@@ -1,4 +1,4 @@
-"""The one training loop of all Gaussian methods."""
+"""The one training loop of all Gaussian methods: 3DGS (Kerbl et al., 2023)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from tqdm import tqdm
 
 from extrap_train.depth import DepthSource
 from extrap_train.errors import InputError
@@ -15,10 +14,10 @@ from extrap_train.gaussians.init import Points, parameters_from_points
 from extrap_train.gaussians.model import GaussianParameters, Gaussians, from_tensors
 from extrap_train.gaussians.optimiser import GaussianOptimiser, ModuleOptimiser, is_finite
 from extrap_train.gaussians.options import GaussianOptions, Schedule, exponential
-from extrap_train.gaussians.rasterize import Drawing
 from extrap_train.gaussians.recipe import Recipe, Training
 from extrap_train.gaussians.scene import training_scene
 from extrap_train.geometry.cameras import unproject_to_world
+from extrap_train.terminal import track
 from extrap_train.views import Camera, View
 
 WIDEST_START = 0.05
@@ -87,40 +86,57 @@ class Fit:
 
 
 def fit(recipe: Recipe, points: Points | None = None, show_progress: bool = False) -> Fit:
-    """Train from the recipe's own initial points, or from those given (in the frame, on the CPU).
+    """Optimise Gaussians until they look like the photographs (3DGS, algorithm 1).
 
-    The same recipe, points and seed give the same Gaussians on a CPU. Raises InputError without
-    usable points, `Diverged` where the loss or anything that is learnt stops being finite.
+    Starts from the recipe's own points, or from those given (in the frame, on the CPU). The same
+    recipe, points and seed give the same Gaussians on a CPU. Raises InputError without usable
+    points, `Diverged` where the loss or anything that is learnt stops being finite.
     """
-    options = recipe.options
+    options, scene = recipe.options, recipe.scene
+    training = _begin(recipe, recipe.initial_points() if points is None else points)
+    optimiser, schedule = training.optimiser, training.schedule
+    modules = ModuleOptimiser(recipe.modules(), schedule)
+    order: list[int] = []
+    count = options.iterations
+    iterations = range(1, count + 1)
+    for iteration in track(iterations, "fitting Gaussians", count, "it", shown=show_progress):
+        training.iteration = iteration
+        order = order or torch.randperm(len(scene.views), generator=training.generator).tolist()
+        index = order.pop()  # every photograph once before any comes again
+        progress = iteration / count
+        optimiser.set_rate("means", learning_rates(options, schedule, progress)["means"])
+        for step in recipe.steps(training):  # of 3DGS: the photometric one alone
+            objective = step(training, index)  # (1 − λ)·L1 + λ·(1 − SSIM), equation 7
+            if not objective.loss.detach().isfinite():
+                raise _diverged(f"the loss became {float(objective.loss)}", training)
+            objective.loss.backward()
+            if objective.drawing is not None:
+                training.statistics.add_drawing(objective.drawing)
+            optimiser.step(recipe.means_factor)
+            modules.step(progress)
+            if not optimiser.parameters.means.detach().abs().max() < FARTHEST:
+                raise _diverged("a Gaussian left the scene", training)
+        _check(training, modules)
+        recipe.adapt(training)  # clone, split, prune and reset opacities, section 5.2
+    _check(training, modules)
+    learnt = optimiser.parameters.tensors()
+    return Fit(from_tensors({name: value.detach() for name, value in learnt.items()}), recipe)
+
+
+def _begin(recipe: Recipe, points: Points) -> Training:
+    options, scene = recipe.options, recipe.scene
     schedule = Schedule(options.iterations, options.full_iterations)
-    start = recipe.initial_points() if points is None else points
-    eyes = torch.stack([view.camera.center for view in recipe.scene.views])
-    widest = WIDEST_START * torch.cdist(start.positions, eyes).amin(1)
-    parameters = parameters_from_points(start, options.sh_degree, options.init_opacity, widest)
-    rates = learning_rates(options, schedule, progress=0.0)
+    eyes = torch.stack([view.camera.center for view in scene.views])
+    widest = WIDEST_START * torch.cdist(points.positions, eyes).amin(1)
+    parameters = parameters_from_points(points, options.sh_degree, options.init_opacity, widest)
     parameters = parameters.to(options.device)
-    training = Training(
-        GaussianOptimiser(parameters, rates),
-        GrowthStatistics.empty(parameters.means),
-        schedule,
-        recipe.generator,
-    )
-    record = recipe.scene.record
-    record["schedule"] = (
+    optimiser = GaussianOptimiser(parameters, learning_rates(options, schedule, progress=0.0))
+    scene.record["schedule"] = (
         f"{options.iterations} of {options.full_iterations} iterations, "
         f"learning rates x {schedule.rate_factor:.3g}"
     )
-    modules = ModuleOptimiser(recipe.modules(), schedule)
-    order: list[int] = []
-    for step in tqdm(range(1, options.iterations + 1), disable=not show_progress, unit="it"):
-        training.iteration = step
-        if not order:
-            count = len(recipe.scene.views)
-            order = torch.randperm(count, generator=training.generator).tolist()
-        _iterate(recipe, training, modules, order.pop())
-    _check(training, modules)
-    return Fit(from_tensors({k: v.detach() for k, v in _tensors(training).items()}), recipe)
+    statistics = GrowthStatistics.empty(parameters.means)
+    return Training(optimiser, statistics, schedule, recipe.generator)
 
 
 def learning_rates(
@@ -139,29 +155,9 @@ def learning_rates(
     }
 
 
-def _iterate(recipe: Recipe, training: Training, modules: ModuleOptimiser, index: int) -> None:
-    progress = training.iteration / recipe.options.iterations
-    rates = learning_rates(recipe.options, training.schedule, progress)
-    training.optimiser.set_rate("means", rates["means"])
-    for step in recipe.steps(training):
-        objective = step(training, index)
-        loss = objective.loss.detach()
-        if not loss.isfinite():
-            raise _diverged(f"the loss became {float(loss)}", training)
-        objective.loss.backward()
-        if objective.drawing is not None:
-            _watch(training.statistics, objective.drawing)
-        training.optimiser.step(recipe.means_factor)
-        modules.step(progress)
-        if not training.optimiser.parameters.means.detach().abs().max() < FARTHEST:
-            raise _diverged("a Gaussian left the scene", training)
-    _check(training, modules)
-    recipe.adapt(training)
-
-
 def _check(training: Training, modules: ModuleOptimiser) -> None:
     """What a loss of finite numbers can hide: a Gaussian that is NaN is not drawn."""
-    for name, values in _tensors(training).items():
+    for name, values in training.optimiser.parameters.tensors().items():
         if not is_finite(values):
             raise _diverged(f"{name} stopped being finite", training)
     if not modules.is_finite():
@@ -173,18 +169,6 @@ def _diverged(what: str, training: Training) -> Diverged:
         f"{what} in iteration {training.iteration} of {training.schedule.iterations}; "
         "lower the learning rates or check the input"
     )
-
-
-def _watch(statistics: GrowthStatistics, drawing: Drawing) -> None:
-    gradient = drawing.centers.grad
-    if gradient is not None:
-        height, width = drawing.depth.shape
-        radii = drawing.radii[0].amax(-1).float()
-        statistics.add(gradient[0], radii, height, width)
-
-
-def _tensors(training: Training) -> dict[str, Tensor]:
-    return training.optimiser.parameters.tensors()
 
 
 def fit_views(

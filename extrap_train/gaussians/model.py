@@ -48,11 +48,6 @@ def rgb_to_sh(rgb: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
     return (rgb - 0.5) / SH_DC
 
 
-def sh_to_rgb(sh: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-    """The colour of a degree-0 coefficient alone."""
-    return sh * SH_DC + 0.5
-
-
 _DEGREE_1 = 0.4886025119029199
 _DEGREE_2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 _DEGREE_3 = (

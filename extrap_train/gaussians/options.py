@@ -3,10 +3,8 @@
 import math
 from dataclasses import dataclass
 
-from extrap_train.errors import InputError
-from extrap_train.gaussians.checks import check_range, check_word
+from extrap_train.config.options import check_options, option
 
-INITS = ("triangulated", "dense", "random")
 BACKGROUNDS = {"black": 0.0, "white": 1.0}
 RASTERIZERS = {"numba": "cpu", "gsplat": "cuda"}
 """What draws, and the device that it draws on."""
@@ -14,63 +12,63 @@ RASTERIZERS = {"numba": "cpu", "gsplat": "cuda"}
 
 @dataclass(frozen=True)
 class GaussianOptions:
-    """Options of the one training loop.
+    """Options of the one training loop; lengths are in extents of the scene.
 
     Everything that counts iterations is written for `full_iterations`, as published, and scaled to
-    the `iterations` that are really run; learning rates are raised as `schedule.py` says.
+    the `iterations` that are really run; learning rates are raised as `Schedule` says.
     """
 
-    iterations: int = 1000
-    """Steps that are run."""
-    full_iterations: int = 30_000
-    """Steps that the published numbers below are for."""
-    init: str = "triangulated"
-    """`triangulated` (SIFT between the inputs, at their poses), `dense` (the depth source's pixels)
-    or `random`.
-    """
-    init_points: int = 1000
-    """Points of `random`; `triangulated` is filled up to it with random ones; most of `dense`."""
-    init_opacity: float = 0.1
-    max_gaussians: int = 10_000
-    """Growth stops here, and the result says so."""
-    sh_degree: int = 3
-    sh_every: int = 1000
-    """Iterations after which another degree takes part."""
-    ssim_weight: float = 0.2
-    l1_weight: float = 0.8
-    background: str = "black"
-    """`black` or `white`, behind everything."""
+    iterations: int = option(1000, "steps that are run", low=1)
+    full_iterations: int = option(30_000, "steps that the published numbers are for", low=1)
+    init: str = option(
+        "triangulated",
+        "SIFT between the inputs at their poses, the depth source's pixels (dense), or random",
+        known=("triangulated", "dense", "random"),
+    )
+    init_points: int = option(
+        1000, "points of random, most of dense; triangulated is filled up to it at random", low=0
+    )
+    init_opacity: float = option(0.1, "opacity at the start", low=0.001, high=0.999)
+    max_gaussians: int = option(10_000, "growth stops here, and the result says so", low=1)
+    sh_degree: int = option(3, "highest degree of the spherical harmonics", low=0, high=3)
+    sh_every: int = option(1000, "iterations after which another degree takes part", low=1)
+    ssim_weight: float = option(0.2, "weight of 1 - SSIM in the photometric loss", low=0)
+    l1_weight: float = option(0.8, "weight of L1 in the photometric loss", low=0)
+    background: str = option("black", "behind everything", known=tuple(BACKGROUNDS))
 
-    means_rate: float = 1.6e-4
-    """Learning rates of Adam; positions in units of the scene's extent, to `means_rate_final`."""
-    means_rate_final: float = 1.6e-6
-    sh_dc_rate: float = 2.5e-3
-    sh_rest_rate: float = 1.25e-4
-    opacity_logits_rate: float = 0.05
-    log_scales_rate: float = 5e-3
-    quats_rate: float = 1e-3
+    means_rate: float = option(1.6e-4, "learning rate of positions, in extents", low=0)
+    means_rate_final: float = option(1.6e-6, "the same at the end", low=0)
+    sh_dc_rate: float = option(2.5e-3, "learning rate of the constant colour", low=0)
+    sh_rest_rate: float = option(1.25e-4, "learning rate of the other harmonics", low=0)
+    opacity_logits_rate: float = option(0.05, "learning rate of opacities", low=0)
+    log_scales_rate: float = option(5e-3, "learning rate of sizes", low=0)
+    quats_rate: float = option(1e-3, "learning rate of rotations", low=0)
 
-    densify_from: int = 500
-    densify_until: int = 15_000
-    """0: the number of Gaussians stays as it starts."""
-    densify_every: int = 100
-    densify_gradient: float = 2e-4
-    """Mean length of the loss's gradient to the projected centre, in half image sides (NDC)."""
-    densify_least_opacity: float = 0.0
-    """Only Gaussians above it are cloned and split."""
-    split_scale: float = 0.01
-    """Larger ones are split, smaller ones cloned; in extents."""
-    prune_opacity: float = 0.005
-    prune_scale: float = math.inf
-    """Larger ones are removed once opacity has been reset; in extents. Published: 0.1, for millions
-    of Gaussians; thousands cannot cover a room with such small ones.
-    """
-    reset_every: int = 3000
-    """0: opacity is never reset."""
-    reset_first: int = 3000
-    reset_opacity: float = 0.01
-    rasterizer: str = "numba"
-    """`numba` on the CPU, or `gsplat` on a GPU."""
+    densify_from: int = option(500, "iteration from which Gaussians are added", low=0)
+    densify_until: int = option(15_000, "last iteration with growth; 0: none at all", low=0)
+    densify_every: int = option(100, "iterations between two growths", low=0)
+    densify_gradient: float = option(
+        2e-4,
+        "least mean gradient of the loss to a projected centre for growth, in half image sides",
+        low=0,
+    )
+    densify_least_opacity: float = option(
+        0.0, "only more opaque Gaussians are cloned and split", low=0, high=1
+    )
+    split_scale: float = option(0.01, "larger Gaussians are split, smaller ones cloned", low=0)
+    prune_opacity: float = option(0.005, "fainter Gaussians are removed", low=0, high=1)
+    prune_scale: float = option(
+        math.inf,
+        "larger Gaussians are removed once opacity has been reset (published: 0.1, for millions of "
+        "Gaussians; thousands cannot cover a room with such small ones)",
+        low=0,
+    )
+    reset_every: int = option(3000, "iterations between resets of opacity; 0: none", low=0)
+    reset_first: int = option(3000, "iteration of the first reset", low=0)
+    reset_opacity: float = option(0.01, "opacity after a reset", low=0, high=1)
+    rasterizer: str = option(
+        "numba", "numba on the CPU, or gsplat on a GPU", known=tuple(RASTERIZERS)
+    )
 
     @property
     def device(self) -> str:
@@ -78,16 +76,8 @@ class GaussianOptions:
         return RASTERIZERS[self.rasterizer]
 
     def __post_init__(self) -> None:
-        """InputError for the first option that cannot be meant."""
-        for name in ("iterations", "full_iterations", "max_gaussians", "sh_every"):
-            check_range(name, getattr(self, name), 1)
-        check_range("init_points", self.init_points, 0)
-        check_range("sh_degree", self.sh_degree, 0, 3)
-        if not 0 < self.init_opacity < 1:
-            raise InputError(f"init_opacity={self.init_opacity}: must be between 0 and 1")
-        check_word("init", self.init, INITS)
-        check_word("background", self.background, BACKGROUNDS)
-        check_word("rasterizer", self.rasterizer, RASTERIZERS)
+        """InputError for the first option out of its range."""
+        check_options(self)
 
 
 LEAST_BETWEEN_GROWTH = 25
@@ -123,11 +113,6 @@ class Schedule:
         """
         since = iteration - max(1, self.at(first))
         return interval > 0 and since >= 0 and since % max(least, self.at(interval)) == 0
-
-    def between(self, iteration: int, full_from: float, full_until: float) -> bool:
-        """Whether the iteration lies in (from, until) of the published schedule."""
-        place = iteration * self.full_iterations / self.iterations
-        return full_from < place < full_until
 
 
 def exponential(start: float, end: float, progress: float) -> float:

@@ -16,7 +16,7 @@ from benchmarks.methods.base import SceneInputs
 from benchmarks.methods.dngaussian import DnGaussian
 from benchmarks.methods.fsgs import Fsgs
 from benchmarks.methods.gaussian_method import GaussianMethod
-from benchmarks.methods.instantsplat import InstantSplat, aligned_to_photograph
+from benchmarks.methods.instantsplat import InstantSplat
 from benchmarks.methods.threedgs import ThreeDgs
 from extrap_train.depth import DepthMap
 from extrap_train.depth.dataset import DatasetDepth
@@ -160,17 +160,6 @@ def test_a_camera_that_was_left_behind_is_seen(
     inputs, _ = scene_inputs(size=24)
     with two_devices, pytest.raises(AssertionError):
         replace(METHODS["3dgs"], rasterizer="gsplat").fitted(inputs)
-
-
-def test_a_pose_is_aligned_where_its_camera_is() -> None:
-    view = scene_inputs(size=16)[0].views[0]
-    with TwoDevices():
-        camera, photograph = view.camera.to(DEVICE), view.image.to(DEVICE)
-        aligned = aligned_to_photograph(
-            lambda moved: photograph * moved.world_to_cam[2, 3], camera, photograph, steps=3
-        )
-        assert aligned.world_to_cam.device.type == DEVICE
-        assert not aligned.world_to_cam.cpu().equal(view.camera.world_to_cam)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device and gsplat")

@@ -7,7 +7,6 @@ import torch
 from benchmarks.methods.fsgs import pseudo_camera
 from benchmarks.methods.instantsplat import (
     PoseCorrections,
-    aligned_to_photograph,
     similarity_between,
 )
 from extrap_train.geometry.cameras import project
@@ -83,20 +82,3 @@ def test_pseudo_cameras_stand_between_two_inputs_and_look_at_the_scene():
         between = [float(toward @ each.forward) for each in cameras[:2]]
         if min(between) > math.cos(math.radians(41)):
             assert float(camera.forward @ toward) > math.cos(math.radians(5))
-
-
-def test_a_pose_is_recovered_from_a_photograph():
-    """The picture is the pose itself, so that the minimum is known."""
-    truth = orbit_camera(0.0, distance=1.0)
-
-    def render(camera: Camera) -> torch.Tensor:
-        return (
-            camera.world_to_cam[:3, :3].reshape(3, 3, 1)
-            + 2
-            + camera.world_to_cam[:3, 3, None, None]
-        )
-
-    start = _moved(truth, torch.eye(3), torch.tensor([0.05, -0.03, 0.02]), 1.0)
-    found = aligned_to_photograph(render, start, render(truth), steps=200)
-    before = (start.center - truth.center).norm()
-    assert (found.center - truth.center).norm() < 0.3 * before
