@@ -8,7 +8,7 @@ from extrap_train.config import DataPrepConfig
 
 def _run(config: DataPrepConfig) -> None:
     # Heavy imports wait until the options are known to be right.
-    from data_prep.category import check_members, prepare_category
+    from data_prep.category_pairs import check_members, prepare_category
     from data_prep.prep_report import write_report
     from extrap_train.terminal import terminal
 

@@ -21,7 +21,7 @@ def _run(config: TrainConfig) -> Outcome | Path | None:
 
 
 def _prepare(config: TrainConfig) -> "list[PreparedData]":
-    from data_prep.category import prepare_for_training
+    from data_prep.category_pairs import prepare_for_training
 
     return prepare_for_training(config)
 

@@ -24,8 +24,8 @@ from extrap_train.depth.sources import depth_source
 from extrap_train.device import fastest_device
 from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.gaussians.fit import fit_views
-from extrap_train.gaussians.model import Gaussians
-from extrap_train.gaussians.options import GaussianOptions
+from extrap_train.gaussians.gaussian_model import Gaussians
+from extrap_train.gaussians.gaussian_options import GaussianOptions
 from extrap_train.tasks import complete
 from extrap_train.tasks.scene_model import open_model
 from extrap_train.text_values import yaml_words

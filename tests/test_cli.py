@@ -356,7 +356,7 @@ def test_data_prep_takes_threads_for_its_processes(
     words: list[str], workers: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[int | None] = []
-    take = "data_prep.category.prepare_category"
+    take = "data_prep.category_pairs.prepare_category"
     monkeypatch.setattr(take, lambda *_, **options: asked.append(options["workers"]))
     monkeypatch.setattr("data_prep.prep_report.write_report", lambda *_: None)
     monkeypatch.setattr(sys, "argv", ["it", "category=hydrant", *words])

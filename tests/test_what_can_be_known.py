@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from data_prep.category import prepare_category
+from data_prep.category_pairs import prepare_category
 from extrap_train.config import DatasetDepthConfig, FlowMatcherConfig, PrepConfig, SyntheticConfig
 from extrap_train.data.examples import ExampleReader, linspace_indices
 from extrap_train.data.module import ValidationBatches, compute_warp

@@ -16,13 +16,13 @@ from benchmarks.methods.gaussian_method import (
 from extrap_train.config.options import option
 from extrap_train.errors import InputError
 from extrap_train.gaussians.density import remove
+from extrap_train.gaussians.gaussian_model import GaussianParameters, Gaussians, sh_basis
+from extrap_train.gaussians.gaussian_options import MIN_BETWEEN_GROWTH
 from extrap_train.gaussians.init import nearest_expected
-from extrap_train.gaussians.losses import edge_aware_smoothness, filled, patch_depth_loss
-from extrap_train.gaussians.model import GaussianParameters, Gaussians, sh_basis
-from extrap_train.gaussians.options import LEAST_BETWEEN_GROWTH
+from extrap_train.gaussians.losses import edge_aware_smoothness, fill_unknown, patch_depth_loss
 from extrap_train.gaussians.rasterize import Drawing, draw
 from extrap_train.gaussians.recipe import Objective, Recipe, Step, Training
-from extrap_train.gaussians.scene import TrainingScene
+from extrap_train.gaussians.training_scene import TrainingScene
 from extrap_train.views import Camera
 
 _OPAQUE = 0.2
@@ -112,7 +112,7 @@ class DnGaussianRecipe(Recipe):
         super().__init__(options, scene)
         source = monocular_source(scene, options.monocular)
         priors = prior_depths(scene, source, options.device)
-        self._priors = [filled(prior) for prior in priors]
+        self._priors = [fill_unknown(prior) for prior in priors]
         self._neural = None
         if options.color == "neural":
             with torch.random.fork_rng(devices=[]):
@@ -180,7 +180,7 @@ class DnGaussianRecipe(Recipe):
         """As 3DGS; every while, nothing is left right before an input, or unseen by all of them."""
         super().adapt(training)
         every = self.options.clear_every
-        if training.schedule.due(training.iteration, 0, every, LEAST_BETWEEN_GROWTH):
+        if training.schedule.due(training.iteration, 0, every, MIN_BETWEEN_GROWTH):
             unwanted = self._misplaced(training.optimiser.parameters)
             remove(training.optimiser, training.statistics, unwanted)
 
@@ -261,13 +261,13 @@ class HashGrid(nn.Module):
         low = place.floor()
         far = (place - low)[..., None]
         weight = _per_corner(torch.cat([1 - far, far], -1), torch.mul)
-        index = hashed(low.long()[..., None] + self.near_far) & (self.size - 1)
+        index = hash_corners(low.long()[..., None] + self.near_far) & (self.size - 1)
         level = torch.arange(len(self.cells), device=positions.device)[:, None] * self.size
         values = self.table[index + level]
         return (values * weight[..., None]).sum(2).flatten(1)
 
 
-def hashed(sides: Int[Tensor, "*b 3 2"]) -> Int[Tensor, "*b 8"]:
+def hash_corners(sides: Int[Tensor, "*b 3 2"]) -> Int[Tensor, "*b 8"]:
     """The spatial hash of Teschner et al. (2003) at the eight corners of a cell, from the cell's
     two sides along x, y and z; the last axis is the fastest.
     """

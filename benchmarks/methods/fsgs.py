@@ -17,12 +17,12 @@ from benchmarks.methods.gaussian_method import (
 )
 from extrap_train.config.options import option
 from extrap_train.errors import InputError
+from extrap_train.gaussians.gaussian_model import GaussianParameters, from_tensors
 from extrap_train.gaussians.init import nearest_neighbours
 from extrap_train.gaussians.losses import pearson_depth_loss
-from extrap_train.gaussians.model import GaussianParameters, from_tensors
 from extrap_train.gaussians.rasterize import Drawing
 from extrap_train.gaussians.recipe import Recipe, Training
-from extrap_train.gaussians.scene import TrainingScene
+from extrap_train.gaussians.training_scene import TrainingScene
 from extrap_train.views import Camera, View
 
 NEIGHBOURS = 3
@@ -123,7 +123,7 @@ class FsgsRecipe(Recipe):
 
     def _unpool(self, training: Training) -> None:
         options, count = self.options, len(training.optimiser)
-        new, limited = unpooled(
+        new, limited = unpool(
             training.optimiser.parameters,
             options.unpool_proximity,
             options.unpool_scale,
@@ -137,7 +137,7 @@ class FsgsRecipe(Recipe):
             self.scene.record["unpooling"] = f"stopped at {options.max_gaussians} Gaussians"
 
 
-def unpooled(
+def unpool(
     parameters: GaussianParameters, proximity: float, scale: float, pairing: Pairing, most: int
 ) -> tuple[GaussianParameters, bool]:
     """The Gaussians that fill the gaps between those already there, the most isolated sources'
@@ -151,7 +151,7 @@ def unpooled(
     """
     distance, index = nearest_neighbours(parameters.means, NEIGHBOURS)
     gap = distance.square().mean(1)
-    sources = isolated(parameters, gap, proximity, scale)
+    sources = find_isolated(parameters, gap, proximity, scale)
     source, target = edges(sources, index, pairing)
     limited = len(source) > most
     source, target = source[:most], target[:most]
@@ -172,7 +172,7 @@ def unpooled(
     return new, limited
 
 
-def isolated(
+def find_isolated(
     parameters: GaussianParameters, gap: Float[Tensor, " n"], proximity: float, scale: float
 ) -> Int[Tensor, " s"]:
     """Numbers of the Gaussians that are large and far from their neighbours, farthest first."""
@@ -195,7 +195,7 @@ def edges(
 def pseudo_camera(
     cameras: Sequence[Camera], generator: torch.Generator, jitter: float = 0.05
 ) -> Camera:
-    """A camera on the way from one input to the input nearest to it, looking at the same place.
+    """A camera on the way from one input to the input nearest to it, look_along at the same place.
 
     The position moves on the arc around the origin (the frame's centre) and is shifted by `jitter`
     times its distance at random; the viewing directions are averaged in the same share.
@@ -211,7 +211,7 @@ def pseudo_camera(
     center = center + jitter * center.norm() * noise
     forward = (1 - share) * a.forward + share * b.forward
     down = (1 - share) * a.world_to_cam[1, :3] + share * b.world_to_cam[1, :3]
-    return replace(a, world_to_cam=looking(center, forward, down))
+    return replace(a, world_to_cam=look_along(center, forward, down))
 
 
 def _on_arc(a: Float[Tensor, "3"], b: Float[Tensor, "3"], share: float) -> Float[Tensor, "3"]:
@@ -220,7 +220,7 @@ def _on_arc(a: Float[Tensor, "3"], b: Float[Tensor, "3"], share: float) -> Float
     return straight / straight.norm().clamp_min(1e-6) * radius
 
 
-def looking(
+def look_along(
     center: Float[Tensor, "3"], forward: Float[Tensor, "3"], down: Float[Tensor, "3"]
 ) -> Float[Tensor, "4 4"]:
     """world_to_cam of a camera at `center`; `down` need not be square to `forward`."""

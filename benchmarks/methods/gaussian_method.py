@@ -13,10 +13,10 @@ from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis, photograp
 from extrap_train.depth import DepthSource
 from extrap_train.depth.surrogate import AffineSurrogate
 from extrap_train.gaussians.fit import Fit, fit
+from extrap_train.gaussians.gaussian_options import GaussianOptions
 from extrap_train.gaussians.init import Points, parameters_from_points
-from extrap_train.gaussians.options import GaussianOptions
 from extrap_train.gaussians.recipe import Recipe
-from extrap_train.gaussians.scene import TrainingScene, training_scene
+from extrap_train.gaussians.training_scene import TrainingScene, training_scene
 
 MONOCULAR = ("surrogate", "depth_source")
 """Known values of a method's option `monocular`."""
@@ -34,7 +34,7 @@ class GaussianMethod(GaussianOptions, ABC):
         """None."""
         return ()
 
-    def fitted(self, inputs: SceneInputs) -> Fit:
+    def fit_scene(self, inputs: SceneInputs) -> Fit:
         """The scene that the inputs alone make; the targets are not looked at."""
         return fit(self.recipe(training_scene(inputs.views, inputs.depth_source, inputs.seed)))
 
@@ -42,7 +42,7 @@ class GaussianMethod(GaussianOptions, ABC):
         """Fit, and draw every target; the time is that of preprocessing and optimisation."""
         self._warm_up(inputs)
         with Stopwatch() as watch:
-            trained = self.fitted(inputs)
+            trained = self.fit_scene(inputs)
         return Synthesis(
             images=trained.render(inputs.targets),
             seconds=watch.seconds,

@@ -11,9 +11,9 @@ from benchmarks.methods.gaussian_method import GaussianMethod
 from extrap_train.config.options import option
 from extrap_train.depth import DepthMap
 from extrap_train.gaussians.density import rotation_matrices
-from extrap_train.gaussians.init import Points, joined, pixel_points
+from extrap_train.gaussians.init import Points, join_points, pixel_points
 from extrap_train.gaussians.recipe import Recipe
-from extrap_train.gaussians.scene import TrainingScene
+from extrap_train.gaussians.training_scene import TrainingScene
 from extrap_train.geometry.cameras import project, unproject_to_world
 from extrap_train.views import Camera, View
 
@@ -64,7 +64,7 @@ class InstantSplatRecipe(Recipe):
         views, options = self.scene.views, self.options
         maps = self.scene.depth_maps(self.scene.depth_source)
         wanted = unique_pixels(views, maps, options.covisibility)
-        found = joined([pixel_points(*each) for each in zip(views, maps, wanted, strict=True)])
+        found = join_points([pixel_points(*each) for each in zip(views, maps, wanted, strict=True)])
         points = found.at_most(
             min(options.init_points, options.max_gaussians), self.generator
         )  # fmt: skip

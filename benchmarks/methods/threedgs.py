@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from benchmarks.methods.gaussian_method import GaussianMethod
 from extrap_train.gaussians.recipe import Recipe
-from extrap_train.gaussians.scene import TrainingScene
+from extrap_train.gaussians.training_scene import TrainingScene
 
 
 @dataclass(frozen=True)

@@ -7,14 +7,14 @@ from torch import Tensor
 from torch.nn import functional
 
 from extrap_train.gaussians.projection import LOW_PASS, NEAR_PLANE
-from extrap_train.gaussians.projection_numba import LEAST_ALPHA
+from extrap_train.gaussians.projection_numba import MIN_ALPHA
 from extrap_train.geometry.cameras import pixel_grid
 from extrap_train.views import Camera
 
 TILE = 16
 """Faster here than 32, which took 1.6 to 3 times as long."""
-_MOST_SIGMAS = 3.33
-"""Beyond, even an opaque Gaussian covers less than LEAST_ALPHA."""
+_MAX_SIGMAS = 3.33
+"""Beyond, even an opaque Gaussian covers less than MIN_ALPHA."""
 
 
 def rasterize_reference(
@@ -28,12 +28,12 @@ def rasterize_reference(
     """The image that `rasterization` draws, but that full pixels go on being blended."""
     x, y, z = (means @ camera.world_to_cam[:3, :3].mT + camera.world_to_cam[:3, 3]).unbind(-1)
     centers, covariances = _project(x, y, z, quats, scales, camera)
-    radii = _MOST_SIGMAS * covariances.detach().diagonal(dim1=-2, dim2=-1).sqrt()
+    radii = _MAX_SIGMAS * covariances.detach().diagonal(dim1=-2, dim2=-1).sqrt()
     low, high = centers.detach() - radii, centers.detach() + radii
     conics = torch.linalg.inv(covariances)
     grid = pixel_grid(camera.height, camera.width)
     order = torch.argsort(z)
-    order = order[(z[order] >= NEAR_PLANE) & (opacities[order] >= LEAST_ALPHA)]
+    order = order[(z[order] >= NEAR_PLANE) & (opacities[order] >= MIN_ALPHA)]
     rows = []
     for top in range(0, camera.height, TILE):
         tiles = []
@@ -84,7 +84,7 @@ def _blend(
     dx, dy = (pixels.reshape(-1, 1, 2) - centers).unbind(-1)
     a, b, c = conics[:, 0, 0], conics[:, 0, 1], conics[:, 1, 1]
     alpha = opacities * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
-    alpha = torch.where(alpha >= LEAST_ALPHA, alpha.clamp(max=0.999), 0)
+    alpha = torch.where(alpha >= MIN_ALPHA, alpha.clamp(max=0.999), 0)
     light = torch.cumprod(1 - alpha, 1)
     before = torch.cat([torch.ones_like(light[:, :1]), light[:, :-1]], 1)
     return ((alpha * before) @ colors).reshape(*pixels.shape[:2], -1)

@@ -4,8 +4,8 @@ A tile is held as planes of one small array, in blocks of 4×4 pixels. The inner
 block's pixels and have no branches, so that the compiler makes vector instructions of them. Powers
 of two are polynomials: every exponent lies between log₂(1/255) and 0.
 
-The derivative walks each tile's ellipses back to front. Per meeting of an ellipse with a tile,
-moments of the gradient are summed and written to the meeting's own slot; the slots of an ellipse
+The derivative walks each tile's ellipses back to front. Per overlap of an ellipse with a tile,
+moments of the gradient are summed and written to the overlap's own slot; the slots of an ellipse
 are then added in a fixed order. Nothing is added by two threads, so the same bits come out on any
 number of them.
 """
@@ -19,8 +19,8 @@ from extrap_train.gaussians.tiles_numba import (
     CHANNELS,
     COLUMNS,
     FEATURES,
-    LEAST_LOG,
     LOG_OPACITY,
+    MIN_LOG,
     MOMENTS,
     PRECISION,
     PRECISION_V,
@@ -41,14 +41,14 @@ ACROSS = TILE // SIDE
 BLOCKS = ACROSS * ACROSS
 LIGHT, LEFT, BEHIND, END, COLORS = 0, PIXELS, PIXELS, 2 * PIXELS, 3 * PIXELS
 """Planes of a tile, block by block. Light that is under way (0 once the pixel is full); light that
-is left at the end, or what lies behind as the loss sees it; the last meeting that counts, from 1;
+is left at the end, or what lies behind as the loss sees it; the last overlap that counts, from 1;
 four colours, or their gradients. A tile's planes hold numbers of one type."""
 PLANES = 3 + CHANNELS
 BATCH = 16
 """Ellipses that are fetched together, so that their cache misses overlap."""
 
 ZERO, ONE = np.float32(0), np.float32(1)
-MOST_ALPHA = np.float32(0.999)
+MAX_ALPHA = np.float32(0.999)
 _QUARTER = np.float32(0.25)
 
 
@@ -64,13 +64,13 @@ _P0, _P1, _P2, _P3, _P4, _P5, _P6, _P7 = _power_of_two()
 @compiled(contract=True)
 def alpha_of(log_alpha: np.floating) -> np.floating:
     """2 to that power, and zero where it is below 1/255; at most 1."""
-    x = np.minimum(np.maximum(log_alpha, LEAST_LOG), ZERO) * _QUARTER
+    x = np.minimum(np.maximum(log_alpha, MIN_LOG), ZERO) * _QUARTER
     low = _P0 + x * (_P1 + x * (_P2 + x * _P3))
     high = _P4 + x * (_P5 + x * (_P6 + x * _P7))
     square = x * x
     root = low + square * square * high
     root *= root
-    return root * root if log_alpha >= LEAST_LOG else ZERO
+    return root * root if log_alpha >= MIN_LOG else ZERO
 
 
 @compiled(contract=True)
@@ -103,7 +103,7 @@ def gather(packed: np.ndarray, gaussians: np.ndarray, batch: np.ndarray) -> None
             batch[k, c] = packed[gaussians[k], c]
 
 
-_LEAST_LIGHT = np.float32(1e-4)
+_MIN_LIGHT = np.float32(1e-4)
 """A pixel is full when the next ellipse would leave less light than this."""
 
 
@@ -118,7 +118,7 @@ def blend(
     ends: np.ndarray,
 ) -> None:
     """Fill the last three: up to four channels (h w d), the light that is left, and the number of
-    the tile's last meeting that counts, from 1."""
+    the tile's last overlap that counts, from 1."""
     columns = -(-image.shape[1] // TILE)
     for tile in numba.prange(len(starts) - 1):
         top, left = tile // columns * TILE, tile % columns * TILE
@@ -163,10 +163,10 @@ def _blend_tile(
 
 @compiled(contract=True)
 def _blend_block(
-    pixels: np.ndarray, ellipse: np.ndarray, center: tuple[float, float], meeting: int
+    pixels: np.ndarray, ellipse: np.ndarray, center: tuple[float, float], overlap: int
 ) -> None:
     """Blend an ellipse, whose mean is given from the block's first pixel on, into the block."""
-    u, v, number = pixels.dtype.type(center[0]), pixels.dtype.type(center[1]), np.float32(meeting)
+    u, v, number = pixels.dtype.type(center[0]), pixels.dtype.type(center[1]), np.float32(overlap)
     precision, slope = ellipse[PRECISION], ellipse[SLOPE]
     precision_v, log = ellipse[PRECISION_V], ellipse[LOG_OPACITY]
     first, second = ellipse[FEATURES], ellipse[FEATURES + 1]
@@ -175,10 +175,10 @@ def _blend_block(
         down = np.float32(j >> SIDE_BITS) - v
         apart = np.float32(j & (SIDE - 1)) - u - slope * down
         free = alpha_of(log - precision_v * (down * down) - precision * (apart * apart))
-        alpha = min(free, MOST_ALPHA)
+        alpha = min(free, MAX_ALPHA)
         light = pixels[LIGHT + j]
         after = light * (ONE - alpha)
-        full = after <= _LEAST_LIGHT
+        full = after <= _MIN_LIGHT
         weight = ZERO if full else alpha * light
         pixels[LIGHT + j] = ZERO if full else after
         pixels[LEFT + j] = pixels[LEFT + j] if full else after
@@ -215,7 +215,7 @@ def blend_backward(
     transmittance_grad: np.ndarray,
     moments: np.ndarray,
 ) -> None:
-    """Fill the slots with the moments (slots MOMENTS) of each meeting."""
+    """Fill the slots with the moments (slots MOMENTS) of each overlap."""
     height, width, channels = image_grad.shape
     columns = -(-width // TILE)
     for tile in numba.prange(len(starts) - 1):
@@ -231,8 +231,8 @@ def blend_backward(
                     behind += background[c] * grad
                 planes[LIGHT + pixel], planes[BEHIND + pixel] = light, behind * light
                 planes[END + pixel] = ends[top + y, left + x]
-        meetings = slice(starts[tile], starts[tile + 1])
-        _tile_backward(packed, gaussians[meetings], slots[meetings], top, left, planes, moments)
+        overlaps = slice(starts[tile], starts[tile + 1])
+        _tile_backward(packed, gaussians[overlaps], slots[overlaps], top, left, planes, moments)
 
 
 @compiled(contract=True)
@@ -275,11 +275,11 @@ def _block_backward(
     pixels: np.ndarray,
     ellipse: np.ndarray,
     center: tuple[float, float],
-    meeting: int,
+    overlap: int,
     sums: np.ndarray,
 ) -> None:
     """Take an ellipse off a block, and add what the gradients of the pixels say."""
-    u, v, number = pixels.dtype.type(center[0]), pixels.dtype.type(center[1]), np.float32(meeting)
+    u, v, number = pixels.dtype.type(center[0]), pixels.dtype.type(center[1]), np.float32(overlap)
     precision, slope = ellipse[PRECISION], ellipse[SLOPE]
     precision_v, log = ellipse[PRECISION_V], ellipse[LOG_OPACITY]
     first, second = ellipse[FEATURES], ellipse[FEATURES + 1]
@@ -289,7 +289,7 @@ def _block_backward(
         apart = np.float32(j & (SIDE - 1)) - u - slope * down
         free = alpha_of(log - precision_v * (down * down) - precision * (apart * apart))
         free = free if pixels[END + j] >= number else ZERO
-        alpha = min(free, MOST_ALPHA)
+        alpha = min(free, MAX_ALPHA)
         share = ONE / (ONE - alpha)
         light = pixels[LIGHT + j] * share
         weight = alpha * light
@@ -298,7 +298,7 @@ def _block_backward(
         value = first * one + second * two + third * three + fourth * four
         behind = pixels[BEHIND + j]
         grad = weight * value - alpha * share * behind
-        grad = grad if free <= MOST_ALPHA else ZERO
+        grad = grad if free <= MAX_ALPHA else ZERO
         pixels[LIGHT + j] = light
         pixels[BEHIND + j] = behind + weight * value
         across = grad * apart

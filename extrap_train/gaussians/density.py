@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from extrap_train.gaussians.model import GaussianParameters, from_tensors
+from extrap_train.gaussians.gaussian_model import GaussianParameters, from_tensors
+from extrap_train.gaussians.gaussian_options import GaussianOptions
 from extrap_train.gaussians.optimiser import GaussianOptimiser
-from extrap_train.gaussians.options import GaussianOptions
 from extrap_train.gaussians.rasterize import Drawing
 
 SPLIT_SHRINK = 1.6

@@ -10,12 +10,12 @@ from torch import Tensor
 from extrap_train.depth import DepthSource
 from extrap_train.errors import InputError
 from extrap_train.gaussians.density import GrowthStatistics
+from extrap_train.gaussians.gaussian_model import GaussianParameters, Gaussians, from_tensors
+from extrap_train.gaussians.gaussian_options import GaussianOptions, Schedule, exponential
 from extrap_train.gaussians.init import Points, parameters_from_points
-from extrap_train.gaussians.model import GaussianParameters, Gaussians, from_tensors
 from extrap_train.gaussians.optimiser import GaussianOptimiser, ModuleOptimiser, is_finite
-from extrap_train.gaussians.options import GaussianOptions, Schedule, exponential
 from extrap_train.gaussians.recipe import Recipe, Training
-from extrap_train.gaussians.scene import training_scene
+from extrap_train.gaussians.training_scene import training_scene
 from extrap_train.geometry.cameras import unproject_to_world
 from extrap_train.terminal import track
 from extrap_train.views import Camera, View
@@ -26,7 +26,7 @@ so far that each Gaussian would cover a whole image, which is slow and shows not
 """
 FARTHEST = 1e5
 """Distance from the scene's centre, in extents, that no Gaussian reaches on purpose."""
-LEAST_ALPHA = 0.5
+SURFACE_ALPHA = 0.5
 """Of a pixel that shows a surface; with less, most of what it shows is behind the Gaussians."""
 
 
@@ -58,7 +58,7 @@ class Fit:
     @torch.no_grad()
     def seen_surface(self) -> Float[Tensor, "m 3"]:
         """The surface that the inputs see, in the world: a point for every pixel of theirs with an
-        alpha above `LEAST_ALPHA`, on its ray at the expected depth.
+        alpha above `SURFACE_ALPHA`, on its ray at the expected depth.
 
         The Gaussians' own centres would not do: after a short optimisation nearly all are faint,
         and only together they hide what is behind.
@@ -68,7 +68,7 @@ class Fit:
             camera = self.recipe.camera(index)
             drawing = self.recipe.draw(self.parameters, camera)
             on_rays = unproject_to_world(drawing.depth, camera)
-            points.append(on_rays[drawing.alpha > LEAST_ALPHA])
+            points.append(on_rays[drawing.alpha > SURFACE_ALPHA])
         return self.recipe.scene.frame.points_outside(torch.cat(points)).cpu()
 
     @torch.no_grad()

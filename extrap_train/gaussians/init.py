@@ -19,7 +19,7 @@ from torch import Tensor
 
 from extrap_train.depth import DepthMap
 from extrap_train.errors import InputError
-from extrap_train.gaussians.model import GaussianParameters, rgb_to_sh
+from extrap_train.gaussians.gaussian_model import GaussianParameters, rgb_to_sh
 from extrap_train.geometry.cameras import unproject_to_world
 from extrap_train.geometry.epipolar import epipolar_lines, fundamental_matrix, homogeneous
 from extrap_train.matching.sift import (
@@ -31,7 +31,7 @@ from extrap_train.matching.sift import (
 )
 from extrap_train.views import Camera, View
 
-_LEAST_SPACING = 1e-7**0.5
+_MIN_SPACING = 1e-7**0.5
 FARTHEST = 10.0
 """Greatest depth of random points, as a multiple of the scene centre's depth."""
 NEAREST_UNKNOWN = 0.5
@@ -61,7 +61,7 @@ class Points:
         return self[torch.randperm(len(self), generator=generator)[:count].sort().values]
 
 
-def joined(parts: Sequence[Points]) -> Points:
+def join_points(parts: Sequence[Points]) -> Points:
     """All the points of several sets."""
     return Points(
         torch.cat([part.positions for part in parts]),
@@ -134,7 +134,7 @@ def _sides(camera: Camera) -> Float[Tensor, "4 3"]:
     return torch.nn.functional.normalize(across.flatten(0, 1), dim=1)
 
 
-LEAST_SIDE = 512
+MIN_SIDE = 512
 """Smaller photographs are enlarged to this longer side first: SIFT needs room for its octaves."""
 CONTRAST_THRESHOLD = 0.02
 RATIO = 0.8
@@ -144,11 +144,11 @@ EPIPOLAR_SHARE = 0.006
 
 LARGEST_ERROR_SHARE = 0.006
 """Reprojection error from which a point is dropped, as a share of the image's longer side."""
-LEAST_ANGLE_RAD = 0.026
+MIN_ANGLE_RAD = 0.026
 """Smaller angles (1.5°) between a point's rays leave its depth open."""
 
 
-def triangulated_points(views: Sequence[View]) -> Points:
+def triangulate_points(views: Sequence[View]) -> Points:
     """Points that at least two of the views agree on, in the mean colour of their pixels.
 
     No point at all is a possible answer: views that are far apart share no SIFT features.
@@ -163,7 +163,7 @@ def triangulated_points(views: Sequence[View]) -> Points:
 def _detect(view: View) -> Features:
     """RootSIFT features at a size that leaves SIFT its octaves."""
     height, width = view.image.shape[1:]
-    scale = max(1.0, LEAST_SIDE / max(height, width))
+    scale = max(1.0, MIN_SIDE / max(height, width))
     size = round(height * scale), round(width * scale)
     return root_sift(detect_sift(view.image, size, contrast_threshold=CONTRAST_THRESHOLD))
 
@@ -215,7 +215,7 @@ def _point(
         return None
     error = np.linalg.norm(cam[:, :2] / cam[:, 2:] - pixels, axis=1)
     limits = [LARGEST_ERROR_SHARE * max(camera.height, camera.width) for camera in cameras]
-    if (error > limits).any() or _widest_angle(point, cameras) < LEAST_ANGLE_RAD:
+    if (error > limits).any() or _widest_angle(point, cameras) < MIN_ANGLE_RAD:
         return None
     return np.append(point, _color(pixels, seen))
 
@@ -312,5 +312,5 @@ def nearest_neighbours(
     count = min(count, len(positions) - 1)
     array = positions.detach().cpu().double().numpy()
     distance, index = KDTree(array).query(array, k=count + 1)
-    found = torch.from_numpy(distance[:, 1:]).float().clamp_min(_LEAST_SPACING)
+    found = torch.from_numpy(distance[:, 1:]).float().clamp_min(_MIN_SPACING)
     return found.to(positions.device), torch.from_numpy(index[:, 1:]).to(positions.device)

@@ -25,7 +25,7 @@ def _blur_matrix(size: int, dtype: torch.dtype, device: torch.device) -> Float[T
     return torch.where(offset.abs() <= _WINDOW // 2, weights, 0).to(device, dtype)
 
 
-def blurred(maps: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
+def blur(maps: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
     """The 11×11 Gaussian window (σ 1.5 pixels) of SSIM, zeros beyond the border."""
     height, width = maps.shape[-2:]
     down = _blur_matrix(height, maps.dtype, maps.device)
@@ -43,13 +43,13 @@ class Photograph:
 
 def photograph(image: Float[Tensor, "3 h w"]) -> Photograph:
     """Prepare a photograph to be compared with."""
-    mean = blurred(image)
-    return Photograph(image, mean, blurred(image.square()) - mean.square())
+    mean = blur(image)
+    return Photograph(image, mean, blur(image.square()) - mean.square())
 
 
 def ssim_map(image: Float[Tensor, "3 h w"], truth: Photograph) -> Float[Tensor, "3 h w"]:
     """Structural similarity (Wang et al., 2004) around each pixel, per channel; range 1."""
-    mean, square, product = blurred(torch.stack([image, image.square(), image * truth.image]))
+    mean, square, product = blur(torch.stack([image, image.square(), image * truth.image]))
     variance = square - mean.square()
     covariance = product - mean * truth.mean
     luminance = (2 * mean * truth.mean + _C1) / (mean.square() + truth.mean.square() + _C1)
@@ -64,7 +64,7 @@ def photometric_loss(
     return l1_weight * l1 + ssim_weight * (1 - ssim_map(image, truth).mean())
 
 
-_LEAST_SPREAD = 1e-6
+_MIN_SPREAD = 1e-6
 _GLOBAL_SHARE = 0.01
 """Of the image's spread that a patch's own is raised by (DNGaussian, released code)."""
 
@@ -73,7 +73,7 @@ def pearson(first: Float[Tensor, " n"], second: Float[Tensor, " n"]) -> Float[Te
     """Correlation in [−1, 1]; 0 where one of them is constant."""
     a, b = first - first.mean(), second - second.mean()
     spread = a.norm() * b.norm()
-    return (a * b).sum() / spread.clamp_min(_LEAST_SPREAD**2)
+    return (a * b).sum() / spread.clamp_min(_MIN_SPREAD**2)
 
 
 def pearson_depth_loss(
@@ -108,7 +108,7 @@ def normalised_patches(image: Float[Tensor, "h w"], size: int, local: bool) -> F
     centred = cut - cut.mean(1, keepdim=True)
     whole = image.std()
     spread = cut.std(1, keepdim=True) if local else whole.detach()
-    return centred / (spread + _GLOBAL_SHARE * whole).clamp_min(_LEAST_SPREAD)
+    return centred / (spread + _GLOBAL_SHARE * whole).clamp_min(_MIN_SPREAD)
 
 
 def patch_depth_loss(
@@ -139,7 +139,7 @@ def edge_aware_smoothness(
     return total / weights
 
 
-def filled(prior: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+def fill_unknown(prior: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """The prior with unknown pixels (0) at their neighbours' mean, nearer neighbours first.
 
     Patch losses look at every pixel, and a network's prior has no holes; other sources' do.

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from extrap_train.gaussians.model import GaussianParameters, from_tensors
-from extrap_train.gaussians.options import Schedule, exponential
+from extrap_train.gaussians.gaussian_model import GaussianParameters, from_tensors
+from extrap_train.gaussians.gaussian_options import Schedule, exponential
 
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 

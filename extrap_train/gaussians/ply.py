@@ -15,10 +15,10 @@ from plyfile import PlyData, PlyElement, PlyParseError
 from torch.nn import functional
 
 from extrap_train.errors import InputError
-from extrap_train.gaussians.model import Gaussians
+from extrap_train.gaussians.gaussian_model import Gaussians
 from extrap_train.store.atomic import write_atomic
 
-_LEAST = 1e-6
+_EPSILON = 1e-6
 """Opacities are kept this far from 0 and 1, and scales above it, whose logits are infinite."""
 _DEGREES = range(4)
 
@@ -31,8 +31,8 @@ def write_splats(path: Path, gaussians: Gaussians, comments: Sequence[str] = ())
         torch.zeros_like(gaussians.means),
         dc,
         rest,
-        gaussians.opacities.clamp(_LEAST, 1 - _LEAST).logit()[:, None],
-        gaussians.scales.clamp(min=_LEAST).log(),
+        gaussians.opacities.clamp(_EPSILON, 1 - _EPSILON).logit()[:, None],
+        gaussians.scales.clamp(min=_EPSILON).log(),
         functional.normalize(gaussians.quats, dim=-1),
     ]
     table = torch.cat(columns, 1).detach().cpu().numpy().astype("<f4")

@@ -11,9 +11,9 @@ import numpy as np
 
 from extrap_train.geometry.compiled import compiled
 
-LEAST_ALPHA = 1 / 255
+MIN_ALPHA = 1 / 255
 """What covers a pixel less than this is left out."""
-_MOST_SIGMAS = 3.33
+_MAX_SIGMAS = 3.33
 _VIEW_MARGIN = 0.3
 """Slopes are clamped at this share of half the field of view beyond the image's edge."""
 _BLOCK = 256
@@ -40,13 +40,13 @@ def project_forward(
         turn, axes, rows = np.empty((3, 3)), np.empty((3, 3)), np.empty((2, 3))
         for i in range(block * _BLOCK, min((block + 1) * _BLOCK, len(means))):
             x, y, z = _to_camera(world_to_cam, means[i])
-            drawn = z >= near and opacities[i] >= LEAST_ALPHA
+            drawn = z >= near and opacities[i] >= MIN_ALPHA
             if drawn:
                 _turn(quats[i], turn)
                 _carry_axes(world_to_cam, turn, scales[i], axes)
                 _fill_rows(axes, x, y, z, k, width, height, rows)
                 var_x, var_y, slope, rest = _ellipse(rows, low_pass)
-                reach = min(math.sqrt(2 * math.log(opacities[i] / LEAST_ALPHA)), _MOST_SIGMAS)
+                reach = min(math.sqrt(2 * math.log(opacities[i] / MIN_ALPHA)), _MAX_SIGMAS)
                 u, v = k[0, 0] * x / z + k[0, 2], k[1, 1] * y / z + k[1, 2]
                 far_u = math.ceil(reach * math.sqrt(var_x))
                 far_v = math.ceil(reach * math.sqrt(var_y))

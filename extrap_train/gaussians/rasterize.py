@@ -14,7 +14,7 @@ from torch import Tensor
 
 from extrap_train.errors import InputError
 from extrap_train.gaussians.blend import blend_ellipses
-from extrap_train.gaussians.model import Gaussians, sh_colors
+from extrap_train.gaussians.gaussian_model import Gaussians, sh_colors
 from extrap_train.gaussians.projection import LOW_PASS, NEAR_PLANE, Ellipses, project
 from extrap_train.views import Camera
 
@@ -43,7 +43,7 @@ _ANNOUNCER = _Announcer()
 
 
 @contextmanager
-def announced_compilation() -> Iterator[None]:
+def announce_compilation() -> Iterator[None]:
     """Log a warning, once a process, if numba compiles anything inside."""
     with install_listener("numba:compile", _ANNOUNCER):
         yield
@@ -52,7 +52,7 @@ def announced_compilation() -> Iterator[None]:
 Backend = Literal["numba", "gsplat"]
 """What draws: ours on the CPU, or gsplat on CUDA."""
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
-_LEAST_DIVISOR = 1e-10
+_MIN_DIVISOR = 1e-10
 
 Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 """The signature of `rasterization` below, which is the common part of gsplat's."""
@@ -74,7 +74,7 @@ def rasterizer(name: str) -> Rasterization:
     return partial(on_cuda, packed=False)
 
 
-@announced_compilation()
+@announce_compilation()
 def rasterization(
     means: Float[Tensor, "n 3"],
     quats: Float[Tensor, "n 4"],
@@ -158,7 +158,7 @@ def _draw(
     image, transmittance = blend_ellipses(ellipses, opacities, colors, background, *size)
     alpha = 1 - transmittance
     if mode.endswith("ED"):
-        expected = image[..., -1:] / alpha[..., None].clamp(min=_LEAST_DIVISOR)
+        expected = image[..., -1:] / alpha[..., None].clamp(min=_MIN_DIVISOR)
         image = torch.cat([image[..., :-1], expected], -1)
     return image, alpha
 

@@ -8,25 +8,25 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from extrap_train.gaussians.density import GrowthStatistics, grow, prune, reset_opacity
-from extrap_train.gaussians.init import (
-    Points,
-    joined,
-    pixel_points,
-    random_points,
-    triangulated_points,
-)
-from extrap_train.gaussians.losses import photograph, photometric_loss
-from extrap_train.gaussians.model import GaussianParameters, rgb_to_sh
-from extrap_train.gaussians.optimiser import GaussianOptimiser
-from extrap_train.gaussians.options import (
+from extrap_train.gaussians.gaussian_model import GaussianParameters, rgb_to_sh
+from extrap_train.gaussians.gaussian_options import (
     BACKGROUNDS,
-    LEAST_BETWEEN_GROWTH,
-    LEAST_BETWEEN_RESETS,
+    MIN_BETWEEN_GROWTH,
+    MIN_BETWEEN_RESETS,
     GaussianOptions,
     Schedule,
 )
+from extrap_train.gaussians.init import (
+    Points,
+    join_points,
+    pixel_points,
+    random_points,
+    triangulate_points,
+)
+from extrap_train.gaussians.losses import photograph, photometric_loss
+from extrap_train.gaussians.optimiser import GaussianOptimiser
 from extrap_train.gaussians.rasterize import Drawing, draw, rasterizer
-from extrap_train.gaussians.scene import TrainingScene
+from extrap_train.gaussians.training_scene import TrainingScene
 from extrap_train.views import Camera
 
 
@@ -79,12 +79,12 @@ class Recipe:
             case "dense":
                 maps = self.scene.depth_maps(self.scene.depth_source)
                 parts = [pixel_points(*pair) for pair in zip(views, maps, strict=True)]
-                points = joined(parts).at_most(options.init_points, self.generator)
+                points = join_points(parts).at_most(options.init_points, self.generator)
                 self.scene.record["init"] = f"{len(points)} points of the depth source"
             case _:
-                found = triangulated_points(views)
+                found = triangulate_points(views)
                 missing = max(options.init_points - len(found), 0)
-                points = joined([found, random_points(cameras, missing, self.generator)])
+                points = join_points([found, random_points(cameras, missing, self.generator)])
                 self.scene.record["init"] = (
                     f"{len(found)} points triangulated from the inputs, {missing} random"
                 )
@@ -169,11 +169,11 @@ class Recipe:
         if step >= schedule.at(options.densify_until):
             return
         if step > schedule.at(options.densify_from) and schedule.due(
-            step, options.densify_from, options.densify_every, LEAST_BETWEEN_GROWTH
+            step, options.densify_from, options.densify_every, MIN_BETWEEN_GROWTH
         ):
             self.grow(training)
             was_reset = options.reset_every > 0 and step > schedule.at(options.reset_first)
             prune(training.optimiser, training.statistics, options, large_too=was_reset)
             training.statistics = GrowthStatistics.empty(training.optimiser.parameters.means)
-        if schedule.due(step, options.reset_first, options.reset_every, LEAST_BETWEEN_RESETS):
+        if schedule.due(step, options.reset_first, options.reset_every, MIN_BETWEEN_RESETS):
             reset_opacity(training.optimiser, options.reset_opacity)

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 from jaxtyping import Float, Int
 
-from extrap_train.gaussians.projection_numba import LEAST_ALPHA
+from extrap_train.gaussians.projection_numba import MIN_ALPHA
 from extrap_train.geometry.compiled import compiled
 
 CHANNELS = 4
@@ -23,7 +23,7 @@ COLUMNS = 8 + CHANNELS
 U, V, PRECISION, SLOPE, PRECISION_V, LOG_OPACITY, REACH, FEATURES = 0, 1, 2, 3, 4, 5, 6, 8
 """Columns of a packed ellipse; precisions and logarithms are to base 2."""
 
-LEAST_LOG = np.float32(math.log2(LEAST_ALPHA))
+MIN_LOG = np.float32(math.log2(MIN_ALPHA))
 """No alpha below is blended."""
 _HALF_PER_LN2 = np.float32(0.5 / math.log(2))
 _ZERO, _HALF = np.float32(0), np.float32(0.5)
@@ -48,7 +48,7 @@ def pack(
             packed[i, U], packed[i, V], packed[i, LOG_OPACITY] = means[i, 0], means[i, 1], log
             packed[i, PRECISION], packed[i, SLOPE] = across, shapes[i, 1]
             packed[i, PRECISION_V] = down
-            span = max(log - LEAST_LOG, _ZERO)
+            span = max(log - MIN_LOG, _ZERO)
             slope = shapes[i, 1]
             packed[i, REACH] = math.sqrt(span * (1 / across + slope * slope / down))
             packed[i, REACH + 1] = math.sqrt(span / down)
@@ -91,13 +91,13 @@ _DIGITS = 2**_DIGIT_BITS
 
 
 class Tiles(NamedTuple):
-    """Every meeting of an ellipse with a tile, in the order in which the tile blends them."""
+    """Every overlap of an ellipse with a tile, in the order in which the tile blends them."""
 
     starts: Int[np.ndarray, " tiles1"]
-    """Where each tile's meetings start; the last entry is their number."""
+    """Where each tile's overlaps start; the last entry is their number."""
     gaussians: Int[np.ndarray, " m"]
     slots: Int[np.ndarray, " m"]
-    """Where the backward pass writes what the meeting gives: those of a Gaussian lie together."""
+    """Where the backward pass writes what the overlap gives: those of a Gaussian lie together."""
     slot_starts: Int[np.ndarray, " n1"]
 
 

@@ -14,8 +14,8 @@ from extrap_train.config import SplatsConfig
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError
 from extrap_train.gaussians.fit import fit_views
-from extrap_train.gaussians.model import Gaussians
-from extrap_train.gaussians.options import BACKGROUNDS, GaussianOptions
+from extrap_train.gaussians.gaussian_model import Gaussians
+from extrap_train.gaussians.gaussian_options import BACKGROUNDS, GaussianOptions
 from extrap_train.gaussians.ply import read_comments, read_splats, write_splats
 from extrap_train.gaussians.rasterize import draw, rasterizer
 from extrap_train.geometry.world_frame import WorldFrame

@@ -12,7 +12,7 @@ import torch
 from torch.nn import functional
 
 from data_prep import correct
-from data_prep.category import prepare_category
+from data_prep.category_pairs import prepare_category
 from data_prep.correct import Correction, correct_pair
 from extrap_train.config import Co3dConfig, FlowMatcherConfig, PrepConfig, StereoConfig
 from extrap_train.data.prepared import PreparedData

@@ -13,7 +13,7 @@ import torch
 from captures import frame_entries, replace_frame_entries, write_capture
 from orbits import capture, even, ring
 
-from data_prep.category import prepare_category
+from data_prep.category_pairs import prepare_category
 from extrap_train.config import (
     Co3dConfig,
     DatasetDepthConfig,

@@ -17,7 +17,7 @@ import torch
 from captures import write_capture
 from kornia.feature import LoFTR
 
-from data_prep.category import prepare_category
+from data_prep.category_pairs import prepare_category
 from data_prep.model_cache import PrepModels, release_models
 from data_prep.sequence_job import PrepContext, SequenceJob
 from extrap_train.config import (

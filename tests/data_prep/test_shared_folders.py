@@ -7,7 +7,7 @@ import pytest
 from captures import write_capture
 from orbits import capture, even, ring
 
-from data_prep.category import prepare_category
+from data_prep.category_pairs import prepare_category
 from data_prep.preparation import prepare
 from extrap_train.config import (
     Co3dConfig,

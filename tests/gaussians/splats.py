@@ -2,7 +2,7 @@
 
 import torch
 
-from extrap_train.gaussians.model import Gaussians
+from extrap_train.gaussians.gaussian_model import Gaussians
 
 
 def random_gaussians(count, degree=0, seed=0):

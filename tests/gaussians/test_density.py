@@ -6,7 +6,7 @@ import pytest
 import roma
 import torch
 
-from benchmarks.methods.fsgs import edges, unpooled
+from benchmarks.methods.fsgs import edges, unpool
 from extrap_train.gaussians.density import (
     GrowthStatistics,
     grow,
@@ -15,9 +15,9 @@ from extrap_train.gaussians.density import (
     rotation_matrices,
     split_in_two,
 )
-from extrap_train.gaussians.model import GaussianParameters
+from extrap_train.gaussians.gaussian_model import GaussianParameters
+from extrap_train.gaussians.gaussian_options import GaussianOptions
 from extrap_train.gaussians.optimiser import GaussianOptimiser
-from extrap_train.gaussians.options import GaussianOptions
 
 RATES = dict.fromkeys(("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest"), 1e-2)
 
@@ -133,23 +133,23 @@ def test_opacity_is_capped_and_not_raised():
 def test_unpooling_puts_copies_of_the_neighbour_half_way():
     # distances of the first Gaussian to its three neighbours: 1, 2, 3
     parameters = _row([0.5, 0.01, 0.01, 0.01])
-    new, limited = unpooled(parameters, proximity=1.0, scale=0.1, pairing="paper", most=100)
+    new, limited = unpool(parameters, proximity=1.0, scale=0.1, pairing="paper", most=100)
     assert not limited
     torch.testing.assert_close(new.means[:, 0], torch.tensor([0.5, 1.0, 1.5]))
     torch.testing.assert_close(new.scales, torch.full((3, 3), 0.01))
     torch.testing.assert_close(new.opacities, torch.full((3,), 0.5))
     assert not new.sh_dc.any()
-    assert len(unpooled(parameters, 100.0, 0.1, "paper", most=100)[0]) == 0
-    assert len(unpooled(parameters, 1.0, 0.9, "paper", most=100)[0]) == 0
+    assert len(unpool(parameters, 100.0, 0.1, "paper", most=100)[0]) == 0
+    assert len(unpool(parameters, 1.0, 0.9, "paper", most=100)[0]) == 0
 
 
 def test_where_room_is_short_the_most_isolated_are_unpooled_and_the_cut_is_told():
     parameters = _row([0.5, 0.5, 0.5, 0.5])
     parameters.means[3, 0] = 10.0  # its three neighbours are the farthest
-    new, limited = unpooled(parameters, proximity=1.0, scale=0.1, pairing="paper", most=3)
+    new, limited = unpool(parameters, proximity=1.0, scale=0.1, pairing="paper", most=3)
     torch.testing.assert_close(new.means[:, 0], torch.tensor([6.0, 5.5, 5.0]))
     assert limited
-    assert not unpooled(parameters, proximity=50.0, scale=0.1, pairing="paper", most=9)[1]
+    assert not unpool(parameters, proximity=50.0, scale=0.1, pairing="paper", most=9)[1]
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from extrap_train.gaussians.losses import (
     edge_aware_smoothness,
-    filled,
+    fill_unknown,
     normalised_patches,
     patch_depth_loss,
     patches,
@@ -104,8 +104,8 @@ def test_smoothness_spares_the_guides_edges():
 def test_filling_keeps_what_is_known_and_ends():
     prior = torch.zeros(9, 9)
     prior[0, 0], prior[8, 8] = 1.0, 3.0
-    full = filled(prior)
+    full = fill_unknown(prior)
     assert full[0, 0] == 1
     assert full[8, 8] == 3
     assert ((full >= 1) & (full <= 3)).all()
-    assert not filled(torch.zeros(4, 4)).any()
+    assert not fill_unknown(torch.zeros(4, 4)).any()

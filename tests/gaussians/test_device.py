@@ -22,8 +22,8 @@ from extrap_train.depth import DepthMap
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.gaussians import recipe
 from extrap_train.gaussians.fit import Fit
-from extrap_train.gaussians.model import Gaussians
-from extrap_train.gaussians.options import RASTERIZERS
+from extrap_train.gaussians.gaussian_model import Gaussians
+from extrap_train.gaussians.gaussian_options import RASTERIZERS
 from extrap_train.gaussians.rasterize import rasterization
 from extrap_train.gaussians.recipe import Recipe
 from extrap_train.metrics import psnr
@@ -109,7 +109,7 @@ def _both(
     made = []
     with two_devices:
         for each in (method, replace(method, rasterizer="gsplat")):
-            fitted = each.fitted(inputs)
+            fitted = each.fit_scene(inputs)
             made.append(_Made(fitted.render(inputs.targets), fitted.gaussians(), fitted))
     return made[0], made[1]
 
@@ -159,7 +159,7 @@ def test_a_camera_that_was_left_behind_is_seen(
     monkeypatch.setattr(Recipe, "camera", lambda self, index: self.scene.views[index].camera)
     inputs, _ = scene_inputs(size=24)
     with two_devices, pytest.raises(AssertionError):
-        replace(METHODS["3dgs"], rasterizer="gsplat").fitted(inputs)
+        replace(METHODS["3dgs"], rasterizer="gsplat").fit_scene(inputs)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device and gsplat")
@@ -167,8 +167,8 @@ def test_a_camera_that_was_left_behind_is_seen(
 def test_gsplat_learns_as_much(name: str) -> None:
     """Not bit by bit: its sums have no fixed order."""
     inputs, truth = scene_inputs(size=24)
-    here = METHODS[name].fitted(inputs)
-    there = replace(METHODS[name], rasterizer="gsplat").fitted(inputs)
+    here = METHODS[name].fit_scene(inputs)
+    there = replace(METHODS[name], rasterizer="gsplat").fit_scene(inputs)
     assert {each.device.type for each in there.parameters.tensors().values()} == {"cuda"}
     scores = [float(psnr(each.render(inputs.targets), truth).mean()) for each in (here, there)]
     assert scores[1] == pytest.approx(scores[0], abs=1)

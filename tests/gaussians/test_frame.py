@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from extrap_train.errors import InputError
-from extrap_train.gaussians.scene import scene_frame
+from extrap_train.gaussians.training_scene import scene_frame
 from extrap_train.geometry.cameras import project
 from extrap_train.views import Camera
 from tests.scenes import orbit_camera, scaled

@@ -18,10 +18,10 @@ from extrap_train.depth import DepthMap
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError
 from extrap_train.gaussians.fit import Diverged, Fit, fit, fit_views
-from extrap_train.gaussians.options import GaussianOptions, exponential
+from extrap_train.gaussians.gaussian_options import GaussianOptions, exponential
 from extrap_train.gaussians.ply import read_splats, write_splats
 from extrap_train.gaussians.recipe import Recipe
-from extrap_train.gaussians.scene import training_scene
+from extrap_train.gaussians.training_scene import training_scene
 from extrap_train.geometry.cameras import unproject_to_world
 from extrap_train.metrics import psnr
 from tests.benchmarks.analytic import scene_inputs
@@ -40,17 +40,17 @@ each_method = pytest.mark.parametrize("name", METHODS)
 def _synthesized(name: str) -> tuple[Synthesis, Fit]:
     """What a method makes of the scene, and the fit behind it: once for all tests of it."""
     fits: list[Fit] = []
-    fitted = GaussianMethod.fitted
+    fitted = GaussianMethod.fit_scene
     with pytest.MonkeyPatch.context() as patch:
         keep = lambda method, inputs: fits.append(fitted(method, inputs)) or fits[-1]  # noqa: E731
-        patch.setattr(GaussianMethod, "fitted", keep)
+        patch.setattr(GaussianMethod, "fit_scene", keep)
         return METHODS[name].synthesize(scene_inputs(size=24)[0]), fits[0]
 
 
 @functools.cache
 def _short_fit(name: str) -> Fit:
     """A few iterations on small inputs, to be compared with other fits of the same length."""
-    return replace(METHODS[name], iterations=12).fitted(scene_inputs(size=16)[0])
+    return replace(METHODS[name], iterations=12).fit_scene(scene_inputs(size=16)[0])
 
 
 @each_method
@@ -74,7 +74,7 @@ def test_targets_change_nothing_that_is_learnt(name: str) -> None:
     """Neither their poses nor their number: the same Gaussians, bit by bit, and the same views."""
     inputs, _ = scene_inputs(size=16)
     other, _ = scene_inputs(targets_deg=(200.0, 10.0, 300.0), size=16)
-    first, second = _short_fit(name), replace(METHODS[name], iterations=12).fitted(other)
+    first, second = _short_fit(name), replace(METHODS[name], iterations=12).fit_scene(other)
     for key, value in first.parameters.tensors().items():
         assert value.equal(second.parameters.tensors()[key]), key
     assert first.record == second.record
@@ -89,7 +89,7 @@ def test_an_input_changes_what_is_learnt(name: str) -> None:
     brighter = replace(inputs.views[0], image=(inputs.views[0].image + 0.1).clamp(0, 1))
     changed = replace(inputs, views=(brighter, *inputs.views[1:]))
     first = _short_fit(name).parameters
-    second = replace(METHODS[name], iterations=12).fitted(changed).parameters
+    second = replace(METHODS[name], iterations=12).fit_scene(changed).parameters
     assert len(first) != len(second) or not first.means.equal(second.means)
 
 
@@ -252,7 +252,7 @@ def test_the_record_says_in_how_many_inputs_there_was_depth(name: str) -> None:
     blind = replace(inputs.views[0], depth=torch.zeros(16, 16))
     some = replace(inputs, views=(blind, *inputs.views[1:]))
     method = replace(METHODS[name], iterations=1)
-    assert method.fitted(some).record["monocular depth"] == "in 2 of 3 inputs"
+    assert method.fit_scene(some).record["monocular depth"] == "in 2 of 3 inputs"
 
 
 def test_a_networks_colours_are_baked_for_whoever_takes_the_gaussians_away() -> None:
@@ -289,7 +289,7 @@ def test_the_world_comes_back_in_the_units_it_was_given_in() -> None:
     """The dense start lies where the inputs' depth does, in their world."""
     inputs, _ = scene_inputs(size=16)
     method = InstantSplat(iterations=1, confidence_rates=False)
-    start = replace(method, full_iterations=1).fitted(inputs).gaussians()
+    start = replace(method, full_iterations=1).fit_scene(inputs).gaussians()
     surface = [unproject_to_world(view.depth, view.camera).flatten(0, 1) for view in inputs.views]
     exact = "donot_use_mm_for_euclid_dist"
     distance = torch.cdist(start.means, torch.cat(surface), compute_mode=exact).amin(1)

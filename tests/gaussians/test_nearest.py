@@ -8,6 +8,7 @@ import torch
 
 from benchmarks.methods.dngaussian import DnGaussian
 from extrap_train.gaussians.density import GrowthStatistics
+from extrap_train.gaussians.gaussian_options import Schedule
 from extrap_train.gaussians.init import (
     Points,
     nearest_expected,
@@ -15,9 +16,8 @@ from extrap_train.gaussians.init import (
     random_points,
 )
 from extrap_train.gaussians.optimiser import GaussianOptimiser
-from extrap_train.gaussians.options import Schedule
 from extrap_train.gaussians.recipe import Training
-from extrap_train.gaussians.scene import training_scene
+from extrap_train.gaussians.training_scene import training_scene
 from extrap_train.geometry.cameras import project
 from extrap_train.views import Camera
 from tests.benchmarks.analytic import scene_inputs

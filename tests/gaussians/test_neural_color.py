@@ -2,7 +2,7 @@
 
 import torch
 
-from benchmarks.methods.dngaussian import HashGrid, NeuralColor, hashed
+from benchmarks.methods.dngaussian import HashGrid, NeuralColor, hash_corners
 
 
 def test_the_grid_is_its_table_at_corners_and_linear_between():
@@ -44,4 +44,4 @@ def test_the_hash_is_that_of_each_corners_three_coordinates() -> None:
     sides = torch.tensor([[[3, 4], [-2, -1], [70, 71]]])
     corners = [(x, y, z) for x in (3, 4) for y in (-2, -1) for z in (70, 71)]
     expected = [x ^ (y * 2_654_435_761) ^ (z * 805_459_861) for x, y, z in corners]
-    assert hashed(sides).tolist() == [expected]
+    assert hash_corners(sides).tolist() == [expected]

@@ -7,15 +7,15 @@ import torch
 from scipy.spatial import KDTree
 
 from extrap_train.errors import InputError
+from extrap_train.gaussians.gaussian_model import GaussianParameters
+from extrap_train.gaussians.gaussian_options import Schedule, exponential
 from extrap_train.gaussians.init import (
     Points,
     nearest_neighbours,
     parameters_from_points,
     random_points,
 )
-from extrap_train.gaussians.model import GaussianParameters
 from extrap_train.gaussians.optimiser import GaussianOptimiser
-from extrap_train.gaussians.options import Schedule, exponential
 from extrap_train.geometry.cameras import project
 from tests.scenes import orbit_camera
 

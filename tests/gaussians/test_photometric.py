@@ -5,7 +5,7 @@ import torch
 from skimage.metrics import structural_similarity
 from torch.nn import functional
 
-from extrap_train.gaussians.losses import blurred, photograph, photometric_loss, ssim_map
+from extrap_train.gaussians.losses import blur, photograph, photometric_loss, ssim_map
 
 
 def _pair(height: int = 40, width: int = 32) -> tuple[torch.Tensor, torch.Tensor]:
@@ -30,7 +30,7 @@ def test_the_window_is_a_zero_padded_convolution():
     taps = torch.exp(-(torch.arange(-5, 6).float() ** 2) / (2 * 1.5**2))
     window = torch.outer(taps, taps) / taps.sum() ** 2
     expected = functional.conv2d(image[:, None], window[None, None], padding=5)[:, 0]
-    torch.testing.assert_close(blurred(image), expected, atol=1e-6, rtol=0)
+    torch.testing.assert_close(blur(image), expected, atol=1e-6, rtol=0)
 
 
 def test_equal_images_lose_nothing_and_weights_are_those_given():

@@ -12,11 +12,11 @@ from extrap_train.depth import DepthMap
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError
 from extrap_train.gaussians.density import GrowthStatistics
+from extrap_train.gaussians.gaussian_options import Schedule
 from extrap_train.gaussians.init import parameters_from_points
 from extrap_train.gaussians.optimiser import GaussianOptimiser
-from extrap_train.gaussians.options import Schedule
 from extrap_train.gaussians.recipe import Training
-from extrap_train.gaussians.scene import training_scene
+from extrap_train.gaussians.training_scene import training_scene
 from extrap_train.views import View
 from tests.benchmarks.analytic import scene_inputs
 
@@ -86,6 +86,6 @@ def test_they_are_drawn_in_their_part_of_the_training() -> None:
     inputs, _ = scene_inputs(size=16)
     network = _Network()
     method = replace(OPTIONS, pseudo_every=2)
-    record = method.fitted(replace(inputs, depth_source=network)).record
+    record = method.fit_scene(replace(inputs, depth_source=network)).record
     assert record["pseudo views"] == "yes"
     assert len(network.drawings) == 15

@@ -6,7 +6,7 @@ import pytest
 import torch
 from splats import camera_pose, pinhole, random_gaussians
 
-from extrap_train.gaussians.model import sh_colors
+from extrap_train.gaussians.gaussian_model import sh_colors
 from extrap_train.gaussians.rasterize import rasterization
 
 WIDTH, HEIGHT = 45, 38

@@ -3,10 +3,10 @@
 import torch
 
 from extrap_train.gaussians.fit import Fit
+from extrap_train.gaussians.gaussian_options import GaussianOptions
 from extrap_train.gaussians.init import Points, parameters_from_points
-from extrap_train.gaussians.options import GaussianOptions
 from extrap_train.gaussians.recipe import Recipe
-from extrap_train.gaussians.scene import training_scene
+from extrap_train.gaussians.training_scene import training_scene
 from tests.benchmarks.analytic import scene_inputs
 
 SIDE = 40

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from extrap_train.gaussians.init import projection_matrices, triangulate, triangulated_points
+from extrap_train.gaussians.init import projection_matrices, triangulate, triangulate_points
 from extrap_train.geometry.cameras import project
 from extrap_train.views import View
 from tests.scenes import orbit_camera as analytic_camera
@@ -18,7 +18,7 @@ def views() -> list[View]:
 
 
 def test_points_lie_on_the_surface(views):
-    points = triangulated_points(views)
+    points = triangulate_points(views)
     assert len(points) > 60
     pixels, depth = project(points.positions, views[1].camera)
     column, row = pixels.long().clamp(0, 159).unbind(-1)
@@ -29,7 +29,7 @@ def test_points_lie_on_the_surface(views):
 
 
 def test_points_have_the_colour_of_their_pixels(views):
-    points = triangulated_points(views)
+    points = triangulate_points(views)
     pixels, _ = project(points.positions, views[0].camera)
     column, row = pixels.long().clamp(0, 159).unbind(-1)
     seen = views[0].image[:, row, column].T
@@ -38,7 +38,7 @@ def test_points_have_the_colour_of_their_pixels(views):
 
 def test_a_textureless_scene_has_no_points(views):
     grey = [View(torch.full_like(view.image, 0.5), view.camera) for view in views]
-    assert len(triangulated_points(grey)) == 0
+    assert len(triangulate_points(grey)) == 0
 
 
 def test_exact_pixels_give_the_exact_point():

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from captures import write_capture
 
-from data_prep.category import _said, prepare_category
+from data_prep.category_pairs import _said, prepare_category
 from extrap_train.config import Co3dConfig, DatasetDepthConfig, FlowMatcherConfig, PrepConfig
 
 

@@ -80,9 +80,9 @@ class GaussianOptions:
         check_options(self)
 
 
-LEAST_BETWEEN_GROWTH = 25
+MIN_BETWEEN_GROWTH = 25
 """Iterations between two changes of the number of Gaussians: fewer give no mean gradient."""
-LEAST_BETWEEN_RESETS = 250
+MIN_BETWEEN_RESETS = 250
 """Iterations that opacities get to grow back."""
 
 
