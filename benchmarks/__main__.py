@@ -7,13 +7,11 @@ from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
-from benchmarks.catalogue import Catalogue
-from benchmarks.table_checks import check_table, lpips_weights_of, require_output_alone
+from benchmarks.catalogue import Catalogue, lpips_weights_of, require_only_output
 from extrap_train.config import CATEGORIES, TableConfig
 from extrap_train.errors import InputError
 from extrap_train.exits import Ended, ends_in_one_line
 from extrap_train.help_text import option_rows
-from extrap_train.text_values import yaml_words
 
 PERF_NAMES = ("align", "depth", "gaussians", "prep", "sample", "train", "warp")
 KINDS = ("methods", "tables", "categories")
@@ -75,13 +73,17 @@ def _parser() -> argparse.ArgumentParser:
         )
         _add_config_dir(sub)
 
-    listing = command("list", _list, "what there is")
+    listing = command("list", _list, "list methods, tables and categories")
     listing.add_argument("kind", nargs="?", choices=KINDS, help="default: all")
     _add_config_dir(listing)
-    run = command("run", _run, "make a table: what is there is used, what has failed tried again")
+    run = command("run", _run, "run a table: finished cells are reused, failed ones tried again")
     with_table(run)
-    run.add_argument("--quick", action="store_true", help="the part that the table calls quick")
-    run.add_argument("--dry-run", action="store_true", help="what would run, and how long")
+    run.add_argument(
+        "--quick",
+        action="store_true",
+        help="only the part that the table's options under quick keep",
+    )
+    run.add_argument("--dry-run", action="store_true", help="say what would run, and how long")
     where = run.add_mutually_exclusive_group()
     where.add_argument("--workers", type=_positive, default=0, metavar="N", help="default: cores")
     where.add_argument(
@@ -92,15 +94,15 @@ def _parser() -> argparse.ArgumentParser:
     report = command("report", _report, "write a table's reports again")
     with_table(report)
     report.add_argument("--format", choices=FORMATS, help="default: all")
-    verify = command("verify", _verify, "compute every number anew from the saved images")
+    verify = command("verify", _verify, "compute every number again from the saved images")
     verify.add_argument("results", help="folder of a table's results")
     verify.add_argument(
         "overrides",
         nargs="*",
         metavar="scoring.lpips_weights.NET=FILE",
-        help="where weights lie on this machine",
+        help="files of weights on this machine",
     )
-    compare = command("compare", _compare, "two result sets of one protocol, with intervals")
+    compare = command("compare", _compare, "compare two results of one protocol, with intervals")
     compare.add_argument("before", help="folder of a table's results")
     compare.add_argument("after", help="folder of a table's results")
     perf = command("perf", _perf, "time our kernels against plain implementations")
@@ -115,7 +117,7 @@ def _add_config_dir(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="DIR",
-        help="folder with method/ and table/ of one's own; files in it can be imported",
+        help="folder with your own method/ and table/ and the Python files of the methods",
     )
 
 
@@ -138,21 +140,21 @@ def _list(options: argparse.Namespace) -> int:
 
 
 def _description(catalogue: Catalogue, kind: str, name: str) -> str:
+    content = catalogue.content(kind.removesuffix("s"), name)
     if kind == "tables":
-        table = catalogue.table(name)
-        return f"{table.title}: {', '.join(table.methods)}"
-    method = catalogue.method(name)
-    return method.title + (f" (needs {method.needs})" if method.needs else "")
+        return f"{content.get('title', '')}: {', '.join(content.get('methods', ()))}"
+    needs = content.get("needs")
+    return content.get("title", "") + (f" (needs {needs})" if needs else "")
 
 
-# The rest imports torch: only when it is asked for.
+# Below, torch is imported by the functions that need it.
 
 
 def _run(options: argparse.Namespace) -> int:
     catalogue = Catalogue.with_own(options.config_dir)
-    table = catalogue.table(options.table, yaml_words(options.overrides, TableConfig))
-    check_table(table, catalogue)  # a typing error is told before anything heavy loads
-    from benchmarks.runner import RunOptions, run_table
+    table = catalogue.table(options.table, options.overrides)
+    catalogue.check(table)  # before anything heavy loads
+    from benchmarks.run_table import RunOptions, run_table
 
     run = RunOptions(options.quick, options.dry_run, options.workers, options.slurm)
     failed = run_table(table, catalogue, run)
@@ -163,24 +165,24 @@ def _run(options: argparse.Namespace) -> int:
 
 def _report(options: argparse.Namespace) -> int:
     catalogue = Catalogue.with_own(options.config_dir)
-    require_output_alone(options.overrides)
-    table = catalogue.table(options.table, yaml_words(options.overrides, TableConfig))
-    from benchmarks.plan import TableFolder
-    from benchmarks.report import laid_out, write_reports
-    from benchmarks.results import read_results
+    require_only_output(options.overrides)
+    table = catalogue.table(options.table, options.overrides)
+    from benchmarks.report import lay_out_results, write_reports
+    from benchmarks.report.aggregate import read_results
+    from benchmarks.run.plan import TableFolder
 
     folder = TableFolder(Path(table.output) / table.name)
     formats = (options.format,) if options.format else FORMATS
     results = read_results(folder)
-    for path in write_reports(results, laid_out(results, catalogue), folder, formats):
+    for path in write_reports(results, lay_out_results(results, catalogue), folder, formats):
         print(f"written: {path}")
     return 0
 
 
 def _verify(options: argparse.Namespace) -> int:
     weights = lpips_weights_of(options.overrides)
-    from benchmarks.plan import TableFolder
-    from benchmarks.verify import verify
+    from benchmarks.report.verify import verify
+    from benchmarks.run.plan import TableFolder
 
     found = verify(TableFolder(Path(options.results)), weights)
     for line in [*found.problems, *(f"{c}: not checked: {r}" for c, r in found.unchecked.items())]:
@@ -191,18 +193,15 @@ def _verify(options: argparse.Namespace) -> int:
     rest = f" but {', '.join(found.unchecked)}" if found.unchecked else ""
     print(
         f"{found.cells} cells verified: every metric{rest} follows from the saved images, and "
-        "every row from its table; times and memory are as recorded"
+        "every row from its table; times and memory cannot be checked"
     )
-    print(
-        f"{found.apart} of them were made with the truths out of the methods' reach, as their "
-        "records say"
-    )
+    print(f"{found.apart} of them were made while the truths were out of reach, by their records")
     return 0
 
 
 def _compare(options: argparse.Namespace) -> int:
-    from benchmarks.compare import compare
-    from benchmarks.plan import TableFolder
+    from benchmarks.report.compare import compare
+    from benchmarks.run.plan import TableFolder
 
     table = compare(TableFolder(Path(options.before)), TableFolder(Path(options.after)))
     print(table.to_string(index=False, float_format=lambda value: f"{value:.4f}"))
@@ -217,7 +216,7 @@ def _compare(options: argparse.Namespace) -> int:
 
 def _perf(options: argparse.Namespace) -> int:
     for name in [options.name] if options.name else PERF_NAMES:
-        module = importlib.import_module(f"benchmarks.perf.{name}")
+        module = importlib.import_module(f"benchmarks.perf.{name}_timing")
         timing = importlib.import_module("benchmarks.perf.timing")
         rows = module.run()
         timing.print_rows(rows)

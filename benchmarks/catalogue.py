@@ -1,105 +1,171 @@
-"""What there is to compare: tables and methods as YAMLs, the package's and one's own.
+"""What there is to compare: tables and methods as YAMLs, the package's and the user's own.
 
 Light on purpose (no torch): `benchmark list` and `--help` answer at once.
 """
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any
 
-import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from pydantic import TypeAdapter, ValidationError
 
 import conf
-from extrap_train.config import MethodConfig, TableConfig, dotted
+from extrap_train.command_options import CommandOptions, choices_of
+from extrap_train.config import (
+    LPIPS_NETS,
+    CapturesConfig,
+    MethodConfig,
+    SyntheticConfig,
+    TableConfig,
+    check_options,
+)
 from extrap_train.errors import InputError, did_you_mean
 from extrap_train.store.records import read_yaml
 
-T = TypeVar("T")
+TABLE = CommandOptions("benchmark run", "benchmark", TableConfig, {})
 
 
 @dataclass(frozen=True)
 class Catalogue:
-    """The YAMLs of some folders; a later folder's file wins over an earlier one's of that name."""
+    """The package's YAMLs and those of own folders, of which the last one wins."""
 
-    folders: tuple[Path, ...]
+    own: tuple[str, ...] = ()
 
     @classmethod
     def with_own(cls, own: Sequence[str] = ()) -> "Catalogue":
-        """The package's, and those of one's own folders, which may be imported from as well."""
-        folders = [Path(name).resolve() for name in own]
+        """With own folders, which methods are imported from, in worker processes, too."""
+        folders = [str(Path(name).resolve()) for name in own]
         for folder in folders:
-            if not folder.is_dir():
+            if not Path(folder).is_dir():
                 raise InputError(f"--config-dir {folder}: no such folder")
-            # Beside the YAMLs lies the method's file; worker processes find it there, too.
-            sys.path.insert(0, str(folder))
+            sys.path.insert(0, folder)
         if folders:
-            paths = [*map(str, folders), *filter(None, [os.environ.get("PYTHONPATH")])]
+            paths = [*folders, *filter(None, [os.environ.get("PYTHONPATH")])]
             os.environ["PYTHONPATH"] = os.pathsep.join(paths)
-        return cls((Path(conf.__path__[0]), *folders))
+        return cls(tuple(folders))
 
     def names(self, kind: str) -> list[str]:
-        """Names of the `table`s or `method`s."""
-        return sorted(
-            {file.stem for folder in self.folders for file in (folder / kind).glob("*.yaml")}
-        )
+        """Names of the `table`s, `method`s or `reported` numbers."""
+        return choices_of(kind, self.own)
 
-    def method(self, name: str) -> MethodConfig:
-        """A method by name."""
-        return _typed(MethodConfig, name, self._file("method", name), [])
-
-    def table(self, name: str, overrides: Sequence[str] = ()) -> TableConfig:
-        """A table by name, with `key=value` on top."""
-        return _typed(TableConfig, name, self._file("table", name), overrides)
-
-    def reported(self, name: str) -> dict[str, Any]:
-        """Published numbers by name: `source`, and `rows` of method, views, metric and value."""
-        return read_yaml(self._file("reported", name), "correct it")
-
-    def _file(self, kind: str, name: str) -> Path:
-        for folder in reversed(self.folders):
-            if (file := folder / kind / f"{name}.yaml").is_file():
-                return file
+    def content(self, kind: str, name: str) -> dict[str, Any]:
+        """A YAML's content as it stands; raises InputError for an unknown name."""
+        for folder in [*reversed(self.own), conf.__path__[0]]:
+            if (file := Path(folder) / kind / f"{name}.yaml").is_file():
+                return read_yaml(file, "correct it")
         raise InputError(f"{kind} {name!r} is unknown; {did_you_mean(name, self.names(kind))}")
 
+    def method(self, name: str, options: Mapping[str, Any] | None = None) -> MethodConfig:
+        """A method by name, with options that replace those of its file."""
+        content = self.content("method", name)
+        try:
+            typed = OmegaConf.merge(OmegaConf.structured(MethodConfig), {"name": name}, content)
+            values: dict[str, Any] = OmegaConf.to_container(typed, throw_on_missing=True)  # type: ignore[assignment]
+        except OmegaConfBaseException as error:
+            raise InputError(f"method {name}: {str(error).splitlines()[0]}") from None
+        method = MethodConfig(**values)
+        method.options |= options or {}
+        return method
 
-def _typed(kind: type[T], name: str, file: Path, overrides: Sequence[str]) -> T:
-    """The file over the dataclass's defaults, the overrides over both; nothing in them is
-    interpolated.
-    """
-    wrong = [word for word in overrides if "=" not in word]
-    if wrong:
-        raise InputError(f"{wrong[0]!r} is no key=value")
+    def table(self, name: str, overrides: Sequence[str] = ()) -> TableConfig:
+        """A table by name, with `key=value` on top, composed as every other command's options."""
+        table = _compose(name, self.content("table", name), overrides)
+        check_options(table)
+        return table
+
+    def check(self, table: TableConfig) -> None:
+        """InputError for options that exclude each other, and for names that are unknown."""
+        _check_table(table)
+        _require_known("options", table.options, self.names("method"))
+        _require_known("reported", filter(None, [table.reported]), self.names("reported"))
+        for method in table.methods:
+            self.method(method)
+
+
+def _compose(name: str, content: dict[str, Any], overrides: Sequence[str]) -> TableConfig:
+    from hydra import compose, initialize_config_module  # slow: `list` and `--help` do without
+    from hydra.core.config_store import ConfigStore
+    from hydra.errors import HydraException
+
+    from extrap_train.option_errors import explain
+    from extrap_train.overrides import CommandLine
+
+    words = CommandLine((), tuple(overrides)).prepared(TABLE)
+    words += ["table@_global_=chosen_table", f"name={name}"]
+    store = ConfigStore.instance()
+    store.store(name="benchmark_schema", node=TableConfig)
+    store.store(group="table", name="chosen_table", node=content)
     try:
-        content = read_yaml(file, "correct it")
-        given = OmegaConf.from_dotlist(list(overrides))
-        merged = OmegaConf.merge(OmegaConf.structured(kind), {"name": name}, content, given)
-        missing = sorted(map(str, OmegaConf.missing_keys(merged)))
-        if missing:
-            raise InputError(f"{file}: does not say {missing[0]}; add it")
-        values = OmegaConf.to_container(merged, resolve=False)
-        return TypeAdapter(kind).validate_python(values)
-    except InputError:
-        raise
-    except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        reason = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
-        raise InputError(f"{' '.join([str(file), *overrides])}: {reason}") from None
-    except (OmegaConfBaseException, yaml.YAMLError, ValueError) as error:
-        reason = " ".join(str(error).splitlines()[:1])
-        raise InputError(f"{_blame(kind, file, overrides)}: {reason}") from None
+        with initialize_config_module("conf", version_base="1.3"):
+            table: TableConfig = OmegaConf.to_object(compose("benchmark", words))  # type: ignore[assignment]
+    except (HydraException, OmegaConfBaseException) as error:
+        raise InputError(f"table {name}: {explain(error, TABLE, overrides)}") from None
+    return table
 
 
-def _blame(kind: type[Any], file: Path, overrides: Sequence[str]) -> str:
-    """The override whose key does not exist, with a suggestion, or else where it all stands."""
-    known = list(dotted(cast(dict[str, Any], OmegaConf.to_container(OmegaConf.structured(kind)))))
+def _check_table(table: TableConfig) -> None:
+    """What one option cannot say alone."""
+    rules = table.rules
+    _require_known("draws", table.draws, rules.draws)
+    _require_held_out(table.captures)
+    given = table.captures.source == "reconfusion"  # its files name inputs and targets
+    if rules.draws != ["given"] if given else "given" in rules.draws:
+        raise InputError(
+            f"rules.draws={rules.draws}: captures.source=reconfusion needs rules.draws=[given], "
+            "which no other source has"
+        )
+    if not given and max(rules.views, default=0) >= rules.pool:
+        raise InputError(
+            f"rules.views={rules.views}: no target is left of rules.pool={rules.pool} frames; give "
+            "smaller numbers of views"
+        )
+
+
+def _require_held_out(captures: CapturesConfig) -> None:
+    """InputError for rendered captures that models are trained on: all but the first few."""
+    usual = SyntheticConfig()
+    is_usual = captures.source == "synthetic" and captures.seed == usual.seed
+    if is_usual and captures.sequences > usual.test_sequences:
+        raise InputError(
+            f"captures.sequences={captures.sequences}: models are trained on the rendered captures "
+            f"after the first {usual.test_sequences}; give fewer, or another captures.seed="
+        )
+    for spec in captures.scenes if captures.source == "scenes" else ():
+        scheme, _, name = spec.partition(":")
+        number = name.rpartition("/")[2]
+        is_number = scheme == "synthetic" and number.isascii() and number.isdigit()
+        if is_number and int(number) >= usual.test_sequences:
+            raise InputError(
+                f"captures.scenes: models are trained on {spec}; give one of the first "
+                f"{usual.test_sequences}"
+            )
+
+
+def lpips_weights_of(overrides: Iterable[str]) -> dict[str, str]:
+    """Files by net: the only option of `verify`, since weights lie elsewhere on every machine."""
+    weights = {}
     for word in overrides:
-        key = word.partition("=")[0]
-        if key not in known and not key.startswith(("options.", "scoring.lpips_weights")):
-            return f"there is no option {key}; {did_you_mean(key, known)}"
-    return " ".join([str(file), *overrides])
+        key, _, file = word.partition("=")
+        net = key.removeprefix("scoring.lpips_weights.")
+        if net == key or not file:
+            raise InputError(f"{word}: verify takes only scoring.lpips_weights.NET=FILE")
+        _require_known("scoring.lpips_weights", [net], LPIPS_NETS)
+        weights[net] = file
+    return weights
+
+
+def require_only_output(overrides: Iterable[str]) -> None:
+    """InputError for other options of `report`, which shows a table as it was run."""
+    for word in overrides:
+        if word.partition("=")[0] != "output":
+            raise InputError(f"{word}: report takes only output=FOLDER; run the table with it")
+
+
+def _require_known(option: str, words: Iterable[str], known: Sequence[str]) -> None:
+    for word in words:
+        if word not in known:
+            raise InputError(f"{option}: {word!r} is unknown; {did_you_mean(word, known)}")

@@ -12,7 +12,6 @@ from extrap_train.config import (
     DepthConfig,
     ModelConfig,
     SamplerConfig,
-    TableConfig,
     TrainerConfig,
 )
 from extrap_train.data.module import compute_warp
@@ -28,7 +27,6 @@ from extrap_train.gaussians.gaussian_model import Gaussians
 from extrap_train.gaussians.gaussian_options import GaussianOptions
 from extrap_train.tasks import complete
 from extrap_train.tasks.scene_model import open_model
-from extrap_train.text_values import yaml_words
 from extrap_train.views import Camera, View, Warp, stack_cameras
 
 
@@ -116,14 +114,12 @@ def score_method(
     methods or tables. Cells that are there are reused.
     """
     from benchmarks.catalogue import Catalogue
-    from benchmarks.plan import TableFolder
-    from benchmarks.results import read_results
-    from benchmarks.runner import RunOptions, run_table
-    from benchmarks.table_checks import check_table
+    from benchmarks.report.aggregate import read_results
+    from benchmarks.run.plan import TableFolder
+    from benchmarks.run_table import RunOptions, run_table
 
     catalogue = Catalogue.with_own(config_dirs)
-    words = yaml_words([*options, f"methods=[{method}]"], TableConfig)
-    chosen = catalogue.table(table, words)
-    check_table(chosen, catalogue)
+    chosen = catalogue.table(table, [*options, f"methods=[{method}]"])
+    catalogue.check(chosen)
     run_table(chosen, catalogue, RunOptions(quick))
     return read_results(TableFolder(Path(chosen.output) / chosen.name)).means()

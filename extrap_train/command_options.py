@@ -53,7 +53,7 @@ class CommandOptions:
     @cached_property
     def known(self) -> dict[str, Option]:
         """Every option, those of all variants among them."""
-        nested = {"depth.matcher": GROUPS["matcher"]}
+        nested = {"depth.matcher": GROUPS["matcher"]} if "depth" in self.groups else {}
         found = dict(options_of(self.tree))
         for group, variants in {**self.groups, **nested}.items():
             for variant in variants:

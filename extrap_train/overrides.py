@@ -17,7 +17,6 @@ from extrap_train.command_options import CommandOptions, choices_of, suggest
 from extrap_train.config import Option
 from extrap_train.errors import InputError
 from extrap_train.option_errors import unknown_option
-from extrap_train.text_values import split_at_commas
 
 _FLAGS_WITH_VALUE = (
     *("--config-dir", "-cd", "--config-path", "-cp", "--config-name", "-cn"),
@@ -86,7 +85,8 @@ class CommandLine:
         if mark == "~" or value is None:
             raise InputError(f"{word}: give a value, as {key}=VALUE")
         if key != option.name:  # an entry of a mapping, new or not
-            return f"++{key}={self._text(value, key)}"
+            is_text = option.has_text_entries or _parse(key, value) is None
+            return f"++{key}={self._text(value, key) if is_text else value}"
         if option.kind is str:
             return f"{key}={self._texts(value, option)}"
         _require_grammar(key, value, option)
@@ -108,7 +108,7 @@ class CommandLine:
         """One text, a list of them, or several jobs' values."""
         if self.is_sweep and _SWEEP.fullmatch(value):
             return value
-        parts = split_at_commas(value, lists=option.is_list) if self.is_sweep else [value]
+        parts = _split_at_commas(value, lists=option.is_list) if self.is_sweep else [value]
         return ",".join(
             self._list(part, option) if option.is_list else self._text(part, option.name)
             for part in parts
@@ -118,7 +118,7 @@ class CommandLine:
         if not (value.startswith("[") and value.endswith("]")):
             raise InputError(f"{option.name}={value}: {option.must_be}")
         inner = value[1:-1]
-        texts = [self._text(t.strip(), option.name) for t in split_at_commas(inner)]
+        texts = [self._text(t.strip(), option.name) for t in _split_at_commas(inner)]
         return f"[{','.join(texts)}]" if inner.strip() else "[]"
 
     def _text(self, value: str, key: str) -> str:
@@ -130,6 +130,22 @@ class CommandLine:
             return value
         quote = Quote.single if '"' in value else Quote.double
         return QuotedString(_without_interpolation(value), quote).with_quotes()
+
+
+def _split_at_commas(text: str, *, lists: bool = False) -> list[str]:
+    """The parts between commas that stand in no quotes, nor, of `lists`, in their brackets."""
+    parts, depth, quote, start = [], 0, "", 0
+    for at, letter in enumerate(text):
+        if quote:
+            quote = "" if letter == quote else quote
+        elif letter in "\"'" and not text[start:at].strip():
+            quote = letter  # one within a word, as in it's, is a letter
+        elif lists and letter in "[]":
+            depth += 1 if letter == "[" else -1
+        elif letter == "," and depth == 0:
+            parts.append(text[start:at])
+            start = at + 1
+    return [*parts, text[start:]]
 
 
 def _without_interpolation(text: str) -> str:

@@ -33,7 +33,6 @@ _ORDER = (
     "extrap_train.runs",
     "extrap_train.tasks",
     "extrap_train.sweep",
-    "extrap_train.text_values",
     "extrap_train.command_options",
     "extrap_train.option_errors",
     "extrap_train.help_text",

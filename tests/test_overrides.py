@@ -10,16 +10,17 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
+from benchmarks.catalogue import TABLE
 from extrap_train.__main__ import main
 from extrap_train.cli import TRAIN
-from extrap_train.config import TableConfig, TrainConfig
+from extrap_train.command_options import CommandOptions
+from extrap_train.config import TrainConfig
 from extrap_train.overrides import CommandLine
-from extrap_train.text_values import yaml_words
 
 
-def held(*words: str) -> dict[str, Any]:
+def held(*words: str, command: CommandOptions = TRAIN) -> dict[str, Any]:
     """What the options of one job hold, by Hydra's parser and OmegaConf."""
-    prepared = CommandLine.split(words).prepared(TRAIN)
+    prepared = CommandLine.split(words).prepared(command)
     parsed = OverridesParser.create().parse_overrides(prepared)
     values = OmegaConf.create([override.value() for override in parsed])
     return dict(zip([each.key_or_group for each in parsed], values, strict=True))
@@ -162,10 +163,8 @@ def test_an_entry_of_a_mapping_is_text(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_table_holds_texts_as_they_were_typed() -> None:
     for text in _TEXTS:
-        word = f"scoring.lpips_weights.alex={text}"
-        given = OmegaConf.from_dotlist(yaml_words([f"output={text}", word], TableConfig))
-        values = OmegaConf.to_container(given, resolve=False)
-        assert values == {"output": text, "scoring": {"lpips_weights": {"alex": text}}}
+        words = (f"output={text}", f"scoring.lpips_weights.alex={text}")
+        assert list(held(*words, command=TABLE).values()) == [text, text]
 
 
 @pytest.mark.parametrize(
@@ -179,6 +178,11 @@ def test_a_table_holds_texts_as_they_were_typed() -> None:
         ("options.ours.steps=4", 4),
     ],
 )
-def test_other_values_of_a_table_are_yaml(word: str, value: Any) -> None:
-    (read,) = yaml_words([word], TableConfig)
-    assert OmegaConf.select(OmegaConf.from_dotlist([read]), word.partition("=")[0]) == value
+def test_other_values_of_a_table_have_their_types(word: str, value: Any) -> None:
+    (read,) = held(word, command=TABLE).values()
+    assert read == value
+
+
+def test_a_value_that_hydra_cannot_read_is_text_for_a_method() -> None:
+    (read,) = held("options.ours.weights=/a b/{category}=1/", command=TABLE).values()
+    assert read == "/a b/{category}=1/"

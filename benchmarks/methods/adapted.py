@@ -5,15 +5,14 @@ from dataclasses import dataclass, replace
 from lightning.fabric import Fabric
 from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 
-from benchmarks.methods.base import SceneInputs
+from benchmarks.methods.base import SceneInputs, views_with_depth
 from benchmarks.methods.diffusion import Diffusion, Painted
-from benchmarks.methods.references import views_with_depth
 from extrap_train.config import LoraConfig
+from extrap_train.config.options import option
 from extrap_train.data.scene_pairs import adaptation_pairs
 from extrap_train.diffusion.adaptation import adapt
 from extrap_train.diffusion.lora import temporary_adapter
 from extrap_train.diffusion.model import ExtrapolationModel
-from extrap_train.gaussians.checks import check_range
 
 
 @dataclass(frozen=True)
@@ -24,18 +23,14 @@ class AdaptedDiffusion(Diffusion):
     part of the time, which is spread over the scene's images as that of estimated depth is.
     """
 
-    lora_steps: int = 120
-    """Most steps; the held-out pair may end it sooner."""
-    lora_minutes: float = 30.0
-    """Limit for slow machines. It is not meant to be reached: where it is, the images depend on
-    the machine, and `given` says so.
-    """
-
-    def __post_init__(self) -> None:
-        """InputError for the first option that cannot be meant."""
-        super().__post_init__()
-        check_range("lora_steps", self.lora_steps, 1)
-        check_range("lora_minutes", self.lora_minutes, 0.001)
+    lora_steps: int = option(120, "most steps; the held-out pair may end it sooner", low=1)
+    lora_minutes: float = option(
+        30.0,
+        "limit for slow machines, not meant to be reached: where it is, the images depend on the "
+        "machine, and the row's inputs say so",
+        unit="minutes",
+        low=0.001,
+    )
 
     def painted(self, model: ExtrapolationModel, inputs: SceneInputs) -> Painted:
         """Adapt, paint, and take the adapter off again."""

@@ -7,7 +7,7 @@ A method is added with one file (a class with the two functions of `Method`) and
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -72,6 +72,15 @@ class Synthesis:
 def photographs_used(views: Sequence[View]) -> dict[str, str]:
     """For `Synthesis.given`: at what size the method took the inputs."""
     return {"photographs": f"{views[0].camera.width} px"}
+
+
+def views_with_depth(inputs: SceneInputs) -> list[View]:
+    """The inputs at their finer size with depth from the given source, 0 where it is unsure."""
+    found = inputs.depth_source.depth_maps(inputs.fine_views)
+    return [
+        replace(view, depth=depth.reliable())
+        for view, depth in zip(inputs.fine_views, found, strict=True)
+    ]
 
 
 @runtime_checkable

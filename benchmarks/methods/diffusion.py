@@ -10,15 +10,27 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis, Unavailable, photographs_used
-from benchmarks.methods.references import views_with_depth
-from extrap_train.config import NEAREST_ALONE, SamplerConfig, SamplerOptions, sampler_for
+from benchmarks.methods.base import (
+    SceneInputs,
+    Stopwatch,
+    Synthesis,
+    Unavailable,
+    photographs_used,
+    views_with_depth,
+)
+from extrap_train.config import (
+    FAMILIES,
+    NEAREST_ALONE,
+    SamplerConfig,
+    SamplerOptions,
+    sampler_for,
+)
+from extrap_train.config.options import option, unset
 from extrap_train.diffusion.checkpoint import load_model
 from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.packaged import packaged_name, packaged_weights
 from extrap_train.errors import InputError
-from extrap_train.gaussians.checks import check_range
 
 
 @dataclass(frozen=True)
@@ -39,28 +51,31 @@ class Diffusion:
     A subclass that paints them otherwise has a `painted` of its own.
     """
 
-    family: str = "ours"
-    """What the model is told; the weights must be of this family."""
-    weights: str | None = None
-    """A model folder, or the name of one in the package, where `{category}` stands for the
-    capture's; null is `FAMILY-{category}` for ours, `FAMILY` for the category-agnostic others.
-    """
-    references: int | None = None
-    """Most inputs that a target is warped from; null takes the model's number."""
-    steps: int | None = None
-    """Of the sampler, as `guidance` and `eta` are; null is what the model recommends."""
-    guidance: float | None = None
-    eta: float | None = None
+    family: str = option(
+        "ours",
+        "what the model is conditioned on; the weights must be of this family",
+        known=FAMILIES,
+    )
+    weights: str | None = option(
+        None,
+        "model folder or packaged model, where `{category}` stands for the capture's; null: "
+        "FAMILY-{category} for ours, FAMILY for the category-agnostic others",
+    )
+    references: int | None = option(
+        None, "most inputs that a target is warped from; null: the model's number", low=1
+    )
+    steps: int | None = unset(SamplerConfig, "steps")
+    """As the model recommends if it is null, and so are the next two."""
+    guidance: float | None = unset(SamplerConfig, "guidance")
+    eta: float | None = unset(SamplerConfig, "eta")
 
     def __post_init__(self) -> None:
-        """InputError for the first option that cannot be meant."""
-        if self.references is not None:
-            check_range("references", self.references, 1)
-            if self.references > 1 and self.family in NEAREST_ALONE:
-                raise InputError(
-                    f"references={self.references}, but {self.family} is told of the nearest input "
-                    "alone: leave references= out"
-                )
+        """InputError for options that exclude each other."""
+        if (self.references or 1) > 1 and self.family in NEAREST_ALONE:
+            raise InputError(
+                f"references={self.references}, but {self.family} is told of the nearest input "
+                "alone: leave references= out"
+            )
 
     def sampler(self, model: ExtrapolationModel) -> SamplerConfig:
         """How every view is sampled."""

@@ -6,11 +6,19 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis, photographs_used
-from benchmarks.methods.references import nearest_inputs, views_with_depth
+from benchmarks.methods.base import (
+    SceneInputs,
+    Stopwatch,
+    Synthesis,
+    photographs_used,
+    views_with_depth,
+)
+from extrap_train.config.options import option
 from extrap_train.data.module import compute_warp
 from extrap_train.data.queries import query_batch
 from extrap_train.diffusion.baselines import inpainted_warp
+from extrap_train.geometry.viewpoints import references_by_nearness
+from extrap_train.views import stack_cameras
 
 
 @dataclass(frozen=True)
@@ -37,8 +45,7 @@ class NearestPhoto:
 class InpaintedWarp:
     """The fused warp of the nearest inputs, its holes inpainted (Telea 2004)."""
 
-    references: int = 3
-    """Most inputs that a target is warped from."""
+    references: int = option(3, "most inputs that a target is warped from", low=1)
 
     def weight_files(self, category: str) -> Sequence[Path]:
         """None."""
@@ -53,3 +60,10 @@ class InpaintedWarp:
             assert batch.warp is not None
             images = inpainted_warp(batch.warp).clamp(0, 1)
         return Synthesis(images, watch.seconds / len(images), photographs_used(views))
+
+
+def nearest_inputs(inputs: SceneInputs, count: int) -> list[list[int]]:
+    """For every target the up to `count` nearest inputs, nearest first (METHOD §1)."""
+    cameras = stack_cameras([view.camera for view in inputs.views])
+    order: list[list[int]] = references_by_nearness(cameras, inputs.targets)[:, :count].tolist()
+    return order

@@ -12,7 +12,8 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.perf.live_bytes import LiveBytes
-from benchmarks.perf.warp import ANGLES_DEG, QUERY_ANGLE_DEG, orbit_camera
+from benchmarks.perf.timing import Row, compare
+from benchmarks.perf.warp_timing import ANGLES_DEG, QUERY_ANGLE_DEG, orbit_camera
 from extrap_train.config import ClipConfig, ModelConfig, UNetConfig, VaeConfig
 from extrap_train.data.module import compute_warp
 from extrap_train.diffusion.encoders import Frozen
@@ -40,6 +41,35 @@ def devices() -> list[tuple[torch.device, Size, tuple[int, ...]]]:
     if torch.cuda.is_available():
         measured.append((torch.device("cuda"), Size("full size", 320), (1, 4, 16, 32)))
     return measured
+
+
+def run_all(compare_case: Callable[[torch.device, Size, int, bool], Row]) -> list[Row]:
+    """A row per device and batch size, on a GPU also with torch.compile."""
+    return [
+        compare_case(device, size, count, compiled)
+        for device, size, counts in devices()
+        for count in counts
+        for compiled in ((False, True) if device.type == "cuda" else (False,))
+    ]
+
+
+def compare_and_report(
+    case: str,
+    device: torch.device,
+    count: int,
+    ours: Callable[[], Float[Tensor, "..."]],
+    reference: Callable[[], Float[Tensor, "..."]],
+    repeats: int,
+    flops: int,
+) -> Row:
+    """The row of two implementations; prints the speed and memory of both."""
+    row = compare(case, device, ours, reference, repeats)
+    for name, run_once, taken in (
+        (case, ours, row.ours_ms),
+        ("  plain float32", reference, row.reference_ms),
+    ):
+        print(report(name, device, count, taken, peak_mib(device, run_once), flops))
+    return row
 
 
 def configuration(size: Size) -> ModelConfig:

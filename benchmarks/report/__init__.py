@@ -3,23 +3,23 @@
 from pathlib import Path
 
 from benchmarks.catalogue import Catalogue
-from benchmarks.plan import TableFolder
-from benchmarks.report.layout import Layout, lay_out
+from benchmarks.report.aggregate import Results
 from benchmarks.report.page import page
 from benchmarks.report.plots import plots
+from benchmarks.report.table_layout import Layout, lay_out
 from benchmarks.report.text import latex, markdown, numbers, tables
-from benchmarks.results import Results
+from benchmarks.run.plan import TableFolder
 from extrap_train.store.atomic import write_atomic
 
-__all__ = ["laid_out", "numbers", "write_reports"]
+__all__ = ["lay_out_results", "numbers", "write_reports"]
 
 FORMATS = ("csv", "md", "latex", "html")
 
 
-def laid_out(results: Results, catalogue: Catalogue) -> Layout:
+def lay_out_results(results: Results, catalogue: Catalogue) -> Layout:
     """A table's results, arranged, with the published numbers that it names."""
     reported = results.plan.table.reported
-    return lay_out(results, catalogue.reported(reported) if reported else None)
+    return lay_out(results, catalogue.content("reported", reported) if reported else None)
 
 
 def write_reports(

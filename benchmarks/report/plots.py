@@ -9,9 +9,9 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchmarks.report.layout import name_of
-from benchmarks.results import CAPTURE, Results
-from benchmarks.words import one_line
+from benchmarks.report.aggregate import CAPTURE, Results
+from benchmarks.report.table_layout import name_of
+from benchmarks.run.cell_record import one_line
 
 _BIN_DEG = 20
 _ASIDE_DEG = 0.7

@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import pandas as pd
 
-from benchmarks.report.layout import Entry, Layout, Panel
-from benchmarks.results import Results
-from benchmarks.words import one_line
+from benchmarks.report.aggregate import Results
+from benchmarks.report.table_layout import Entry, Layout, Panel
+from benchmarks.run.cell_record import one_line
 
 _MARKDOWN_SPECIAL = {"<": "&lt;", ">": "&gt;"} | {letter: f"\\{letter}" for letter in "\\`*|[]"}
 _LATEX_SPECIAL = {

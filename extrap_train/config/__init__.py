@@ -8,12 +8,14 @@ from extrap_train.config.benchmark import (
     CAPTURE_SOURCES,
     DRAWS,
     LPIPS_NETS,
+    METRICS,
     CapturesConfig,
     MethodConfig,
     QuickConfig,
     RulesConfig,
     ScoringConfig,
     TableConfig,
+    metric_direction,
 )
 from extrap_train.config.checks import (
     notes,

@@ -10,6 +10,24 @@ CAPTURE_SOURCES = ("synthetic", "co3d", "reconfusion", "scenes")
 DRAWS = ("random", "spread", "one_sided", "given")
 LPIPS_NETS = ("alex", "vgg", "squeeze")
 _SSIM_WINDOW = 11
+_HIGHER_IS_BETTER = (
+    "psnr", "ssim", "masked_psnr", "masked_ssim", "unseen_psnr", "unseen_ssim", "compat_psnr",
+    "compat_ssim", "tsed", "warp_psnr", "completeness", "accuracy_share", "f_score",
+)  # fmt: skip
+_LOWER_IS_BETTER = ("dists", "seconds", *(f"lpips_{net}" for net in LPIPS_NETS))
+_SAME_FOR_ALL_METHODS = ("coverage", "tsed_truth", "warp_psnr_truth")
+_UNRANKED = ("peak_memory_mib", "accuracy_distance")
+"""Memory depends on the machine, and the distance is of those points alone that a method has, which
+may be few and good.
+"""
+METRICS = (*_HIGHER_IS_BETTER, *_LOWER_IS_BETTER, *_SAME_FOR_ALL_METHODS, *_UNRANKED)
+
+
+def metric_direction(metric: str) -> int:
+    """1 where higher is better, -1 where lower is, 0 for a number that ranks no method."""
+    if metric in _HIGHER_IS_BETTER:
+        return 1
+    return -1 if metric in _LOWER_IS_BETTER or metric.startswith("lpips") else 0
 
 
 @dataclass
@@ -23,9 +41,11 @@ class CapturesConfig:
         known=CAPTURE_SOURCES,
     )
     root: str | None = option(None, "folder of the data set; null renders the captures")
-    categories: list[str] = option([], "categories that are measured")
+    categories: list[str] = option([], "categories that are measured", is_set=True)
     sequences: int = option(4, "test sequences per category", low=1, high=10_000)
-    scenes: list[str] = option([], "captures of captures.source=scenes, as scene= takes them")
+    scenes: list[str] = option(
+        [], "captures of captures.source=scenes, as scene= takes them", is_set=True
+    )
     frames: int = option(24, "photographs around a rendered scene", low=1, high=10_000)
     render_size: int = option(128, "side of a rendered photograph", unit="pixels", low=1, high=8192)
     seed: int = option(0, "seed of the rendered scenes", low=0, high=2**30)
@@ -53,15 +73,20 @@ class RulesConfig:
         9, "frames that farthest-point sampling picks from a capture", low=2, high=10_000
     )
     views: list[int] = option(
-        [3, 6], "numbers of inputs; the rest of the pool are targets", low=1, high=10_000
+        [3, 6],
+        "numbers of inputs; the rest of the pool are targets",
+        is_set=True,
+        low=1,
+        high=10_000,
     )
     draws: list[str] = option(
         ["random", "spread", "one_sided"],
         "how the inputs may be drawn from the pool",
+        is_set=True,
         known=DRAWS,
     )
     seeds: list[int] = option(
-        [0], "seeds of the draws and of the methods' own randomness", low=0, high=2**30
+        [0], "seeds of the draws and of the methods' own randomness", is_set=True, low=0, high=2**30
     )
     depth: str = option(
         "dataset", "where the inputs' depth comes from", known=("dataset", "stereo")
@@ -72,9 +97,13 @@ class RulesConfig:
 class ScoringConfig:
     """Which perceptual networks judge, and where their weights lie."""
 
-    lpips: list[str] = option(["alex"], "LPIPS backbones, one column each", known=LPIPS_NETS)
+    lpips: list[str] = option(
+        ["alex"], "LPIPS backbones, one column each", known=LPIPS_NETS, is_set=True
+    )
     lpips_weights: dict[str, str] = option(
-        {}, "full lpips.LPIPS state dicts by net; a net not named takes torch's hub cache"
+        {},
+        "full lpips.LPIPS state dicts by net; a net not named takes torch's hub cache",
+        known=LPIPS_NETS,
     )
     dists: bool = option(True, "measure DISTS, with torchvision's VGG-16 from torch's hub cache")
 
@@ -83,7 +112,7 @@ class ScoringConfig:
 class QuickConfig:
     """What `--quick` keeps of a table."""
 
-    categories: list[str] = option([], "categories that --quick keeps")
+    categories: list[str] = option([], "categories that --quick keeps", is_set=True)
     sequences: int = option(1, "sequences per category that --quick keeps", low=1, high=10_000)
 
 
@@ -96,20 +125,29 @@ class TableConfig:
     captures: CapturesConfig = field(default_factory=CapturesConfig)
     rules: RulesConfig = field(default_factory=RulesConfig)
     scoring: ScoringConfig = field(default_factory=ScoringConfig)
-    methods: list[str] = option([], "rows in their order: names of `benchmark list methods`")
+    methods: list[str] = option(
+        [], "rows in their order: names of `benchmark list methods`", is_set=True
+    )
     options: dict[str, dict[str, Any]] = option(
         {}, "options by method, as options.ours.weights=FOLDER; they replace those of its file"
     )
-    draws: list[str] = option(["random"], "which of rules.draws are run", known=DRAWS)
+    draws: list[str] = option(["random"], "which of rules.draws are run", known=DRAWS, is_set=True)
     quick: QuickConfig = field(default_factory=QuickConfig)
     columns: list[str] = option(
-        [], "metrics of the printed table in their order; the CSV holds all of them"
+        [],
+        "metrics of the printed table in their order; the CSV holds all of them",
+        known=METRICS,
+        is_set=True,
     )
     reported: str | None = option(
         None, "published numbers to print beside ours: a file of conf/reported/"
     )
     output: str = option("results", "folder of all results")
-    device: str = option("auto", "device of the methods: cpu, cuda, or auto: CUDA if there is one")
+    device: str = option(
+        "auto",
+        "device of the methods; auto: CUDA if there is one",
+        known=("auto", "cpu", "cuda"),
+    )
     cell_timeout_s: float = option(
         6 * 3600.0, "most time that a method may take for one cell", unit="s", low=1, high=1e7
     )

@@ -29,7 +29,9 @@ class Declared:
     low: int | float = -math.inf
     high: int | float = math.inf
     known: tuple[str, ...] = ()
-    """The words that a text may be; empty where any is right."""
+    """The words that a text, or a key of a mapping, may be; empty where any is right."""
+    is_set: bool = False
+    """Whether a list must not hold a value twice."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,8 @@ class Option:
     may_be_null: bool
     default: Any
     declared: Declared
+    has_text_entries: bool = False
+    """Of a mapping: whether its values are texts."""
 
     @property
     def has_range(self) -> bool:
@@ -73,8 +77,11 @@ class Option:
         return f"at least {_plain(low)}" if math.isfinite(low) else ""
 
     def check(self, value: Any) -> None:
-        """InputError where the value is out of the range or not among the known words."""
-        for item in value if isinstance(value, list | tuple) else (value,):
+        """InputError where a value is out of the range, not among the known words or repeated."""
+        items = [*value] if isinstance(value, list | tuple | dict) else [value]
+        for index, item in enumerate(items):
+            if self.declared.is_set and item in items[:index]:
+                raise InputError(f"{self.name}: {item} is listed twice; leave one out")
             if isinstance(item, str) and self.declared.known:
                 require_one_of(self.name, item, self.declared.known)
             is_number = isinstance(item, int | float)
@@ -90,9 +97,10 @@ def option(
     low: int | float = -math.inf,
     high: int | float = math.inf,
     known: tuple[str, ...] = (),
+    is_set: bool = False,
 ) -> Any:
     """A dataclass field that is an option, with its default."""
-    metadata = {"option": Declared(meaning, unit, low, high, known)}
+    metadata = {"option": Declared(meaning, unit, low, high, known, is_set)}
     if isinstance(default, list | dict):
         return field(default_factory=lambda: copy.copy(default), metadata=metadata)
     return field(default=default, metadata=metadata)
@@ -129,7 +137,8 @@ def _walk(tree: type, prefix: str) -> Iterator[Option]:
         is_list = get_origin(hint) is list
         kind = get_args(hint)[0] if is_list else get_origin(hint) or hint
         declared = _declared(tree, each.name)
-        yield Option(name, kind, is_list, may_be_null, _default(each), declared)
+        texts = kind is dict and get_args(hint)[1:] == (str,)
+        yield Option(name, kind, is_list, may_be_null, _default(each), declared, texts)
 
 
 def _declared(tree: type, name: str) -> Declared:

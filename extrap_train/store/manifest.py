@@ -106,6 +106,7 @@ def _input_change(before: str | None, now: str | None) -> str:
     return "no longer read" if now is None else "other content"
 
 
+@cache
 def package_version(name: str) -> str | None:
     """The version of an installed package; None if it is not installed."""
     try:

@@ -4,10 +4,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 
-from benchmarks.plan import TableFolder
-from benchmarks.records import Cell, Hashes, Plan, Score
-from benchmarks.results import Results
+from benchmarks.report.aggregate import Results
+from benchmarks.run.cell_record import Cell, Plan
+from benchmarks.run.plan import TableFolder
+from benchmarks.score import Score
 from extrap_train.config import MethodConfig, TableConfig
+from extrap_train.store.manifest import Manifest
 
 
 def cell(
@@ -20,22 +22,20 @@ def cell(
     **given: str,
 ) -> Cell:
     """One with three views of a cup; it has failed where `psnr` is None."""
-    hashes = dict.fromkeys(Hashes.__dataclass_fields__, "")
-    hashes |= {"data": f"photographs of {sequence}", "scoring": scoring}
     state = {"status": "failed", "reason": "no luck"} if psnr is None else {"status": "ok"}
     scores = {} if psnr is None else {"psnr": psnr, **others}
     return Cell(
         key="key",
         method=method,
-        options={},
         category="cup",
         sequence=sequence,
         n_views=3,
         draw="random",
         seed=seed,
         scene=f"cup-{sequence}-3-random-0",
-        device="cpu",
-        hashes=Hashes(**hashes),
+        protocol="0" * 64,
+        made_from=Manifest.of({"device": "cpu"}, {"photographs": f"of {sequence}"}),
+        scored_from=Manifest.of({}, {"code": scoring}),
         seconds=1.0,
         peak_memory_mib=9.0,
         given=given,
@@ -49,5 +49,5 @@ def results(*cells: Cell) -> Results:
     names = dict.fromkeys(cell.method for cell in cells)
     methods = {name: MethodConfig(name=name, title=name, factory="a.B") for name in names}
     table = TableConfig(name="t", columns=["psnr"])
-    plan = Plan(table, False, "0" * 64, {}, methods, ["key"] * len(cells))
+    plan = Plan(table, False, "0" * 64, Manifest.of({}), methods, ["key"] * len(cells))
     return Results(TableFolder(Path("nowhere")), plan, list(cells))

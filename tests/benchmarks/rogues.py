@@ -84,12 +84,12 @@ ENDS = {
     "file_limit": ("resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))", "exit status 1"),
     "forged": (
         "[os.write(f, b'x' * 99) for f in range(3, 64) if is_file(f)]; os._exit(0)",
-        "handed out no result",
+        "returned no result",
     ),
     "forged_pickle": (
         "[os.write(f, b'\\x80\\x04cos\\nabort\\n(tR.') for f in range(3, 64) if is_file(f)]; "
         "os._exit(0)",
-        "handed out no result",
+        "returned no result",
     ),
     "huge": ("made['points'] = torch.zeros(6_000_000, 3)", "points must be"),
     "none": ("returned.append(None)", "AttributeError"),

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from benchmarks.catalogue import Catalogue
-from benchmarks.plan import TableFolder
-from benchmarks.runner import RunOptions, run_table
+from benchmarks.run.plan import TableFolder
+from benchmarks.run_table import RunOptions, run_table
 from extrap_train.jobs import Launcher
 
 _METHOD = '''

@@ -16,11 +16,11 @@ from torchvision.models import (
     squeezenet1_1,
 )
 
-from benchmarks import scoring
 from benchmarks.__main__ import main
-from benchmarks.backbones import judging_files
-from benchmarks.results import read_results
-from benchmarks.verify import Verification, verify
+from benchmarks.report.aggregate import read_results
+from benchmarks.report.verify import Verification, verify
+from benchmarks.run.identity import judging_files
+from benchmarks.score import scoring
 from extrap_train.config import LPIPS_NETS, ScoringConfig
 from extrap_train.errors import InputError
 from extrap_train.metrics import BACKBONES, dists_distance, lpips_distance
@@ -71,10 +71,10 @@ def test_a_backbone_put_into_the_hub_cache_is_used_by_the_next_run(
     assert "lpips_squeeze stays empty: LPIPS (squeeze) has no weights" in said
     put_backbone(0)
     first = _scored(own, tmp_path)
-    assert "0 finished and used again, 2 open" in capsys.readouterr().out
+    assert "0 reused, 2 open" in capsys.readouterr().out
     run_greys(own, tmp_path, "scoring.lpips=[squeeze]", quick=True, dry_run=True)
     said = capsys.readouterr().out
-    assert "2 finished and used again, 0 open" in said
+    assert "2 reused, 0 open" in said
     assert "stays empty" not in said
     put_backbone(1)
     second = _scored(own, tmp_path)

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.captures import open_captures
-from benchmarks.training import TrainedModel, trained_models
+from benchmarks.protocol.captures import TrainedModel, open_captures, trained_models
 from data_prep.split import split_sequences
 from extrap_train.config import CapturesConfig, MethodConfig
 from extrap_train.errors import InputError

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks.compare import compare_results
+from benchmarks.report.compare import compare_results
 from tests.benchmarks.made import cell, results
 
 

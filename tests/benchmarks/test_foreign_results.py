@@ -18,7 +18,7 @@ import pytest
 from PIL import Image
 
 from benchmarks.__main__ import main
-from benchmarks.files import MAX_POINTS, read_points
+from benchmarks.protocol.array_files import MAX_POINTS, read_points
 from extrap_train.errors import InputError
 from tests.benchmarks.tables import greys_folder
 
@@ -75,14 +75,14 @@ def _truth(name: str, content: bytes) -> Callable[[Path, Path], Path]:
         _stated(record, "files", name, truth, content)
         data = _data_hash(scene)
         for file in cell.parent.glob("*/cell.json"):
-            _edit(file, lambda entries: entries["hashes"].update(data=data))
+            _edit(file, lambda entries: entries["made_from"]["inputs"].update(photographs=data))
         return truth
 
     return damage
 
 
 def _data_hash(scene: Path) -> str:
-    from benchmarks.scenes import Scene
+    from benchmarks.protocol.prepared_scene import Scene
 
     return Scene.open(scene).data_hash
 

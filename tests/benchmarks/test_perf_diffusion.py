@@ -16,8 +16,8 @@ from benchmarks.perf.diffusion_case import (
     optimised,
     plain,
 )
-from benchmarks.perf.sample import plain_sampling, sampling
-from benchmarks.perf.train import training_step
+from benchmarks.perf.sample_timing import plain_sampling, sampling
+from benchmarks.perf.train_timing import training_step
 from extrap_train.config import ModelConfig
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.views import PairBatch

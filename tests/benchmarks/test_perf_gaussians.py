@@ -3,10 +3,9 @@
 import pytest
 import torch
 
-from benchmarks.perf.gaussians import cube_of_gaussians
-from benchmarks.perf.gaussians_reference import rasterize_reference
+from benchmarks.perf.gaussians_timing import cube_of_gaussians, rasterize_reference
 from benchmarks.perf.timing import compare
-from benchmarks.perf.warp import orbit_camera
+from benchmarks.perf.warp_timing import orbit_camera
 from extrap_train.errors import InputError
 from extrap_train.gaussians.rasterize import rasterizer
 

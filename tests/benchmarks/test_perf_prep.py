@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from orbits import textured_capture
 
-from benchmarks.perf import prep
+from benchmarks.perf import prep_timing as prep
 from extrap_train.config import PrepConfig, StereoConfig
 from extrap_train.depth.stereo import PlaneSweepStereo
 

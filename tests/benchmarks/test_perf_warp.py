@@ -6,8 +6,7 @@ import torch
 
 from benchmarks.__main__ import main
 from benchmarks.perf.timing import Row, compare, write_rows
-from benchmarks.perf.warp import bumpy_views, orbit_camera
-from benchmarks.perf.warp_reference import splat_reference
+from benchmarks.perf.warp_timing import bumpy_views, orbit_camera, splat_reference
 from extrap_train.geometry.warp import splat_points
 
 

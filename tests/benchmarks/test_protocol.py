@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.protocol import Protocol, draw_sequence, farthest_frames
+from benchmarks.protocol.draws import Protocol, draw_sequence, farthest_frames
 from extrap_train.config import RulesConfig
 from extrap_train.errors import InputError
 from extrap_train.geometry.viewpoints import pairwise_angles, scene_center

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from benchmarks.captures import freeze, open_captures
 from benchmarks.catalogue import Catalogue
-from benchmarks.plan import TableFolder
-from benchmarks.results import read_results
-from benchmarks.runner import RunOptions, run_table
+from benchmarks.protocol.captures import freeze, open_captures
+from benchmarks.report.aggregate import read_results
+from benchmarks.run.plan import TableFolder
+from benchmarks.run_table import RunOptions, run_table
 from extrap_train.config import CapturesConfig, RulesConfig
 from extrap_train.data.images import to_eight_bits
 from extrap_train.errors import InputError

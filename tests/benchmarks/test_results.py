@@ -4,11 +4,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks.chance import mean_interval
-from benchmarks.columns import COLUMNS, direction
-from benchmarks.report.layout import NAMES, Entry, Layout, Panel, Row, lay_out
+from benchmarks.report.aggregate import UNIT, to_best
+from benchmarks.report.table_layout import NAMES, Entry, Layout, Panel, Row, lay_out
 from benchmarks.report.text import latex, markdown
-from benchmarks.results import UNIT, to_best
+from benchmarks.score.significance import mean_interval
+from extrap_train.config import METRICS, metric_direction
 from tests.benchmarks.made import cell, results
 
 
@@ -28,11 +28,16 @@ def test_pairing_sees_a_small_difference_among_large_ones() -> None:
 
 
 def test_every_metric_has_its_direction() -> None:
-    assert direction("lpips_vgg") == direction("dists") == direction("seconds") == -1
-    assert direction("masked_psnr") == direction("tsed") == 1
-    assert direction("coverage") == direction("warp_psnr_truth") == 0
-    assert direction("peak_memory_mib") == direction("accuracy_distance") == 0
-    assert set(NAMES) - {"lpips"} <= COLUMNS
+    assert (
+        metric_direction("lpips_vgg")
+        == metric_direction("dists")
+        == metric_direction("seconds")
+        == -1
+    )
+    assert metric_direction("masked_psnr") == metric_direction("tsed") == 1
+    assert metric_direction("coverage") == metric_direction("warp_psnr_truth") == 0
+    assert metric_direction("peak_memory_mib") == metric_direction("accuracy_distance") == 0
+    assert set(NAMES) - {"lpips"} <= set(METRICS)
 
 
 def test_seeds_of_one_capture_are_no_further_captures() -> None:
@@ -131,7 +136,7 @@ def test_what_was_given_is_said_of_everycell() -> None:
         cell("ours", "2", 0, 30.0, depth="used", ended="steps"),
     )
     notes = "\n".join(lay_out(table, None).notes)
-    assert "Given: ours — depth: used, ended: steps (2 cells) / time (1 cells)." in notes
+    assert "Inputs: ours — depth: used, ended: steps (2 cells) / time (1 cells)." in notes
 
 
 def test_what_differs_in_its_numbers_only_is_said_once() -> None:
@@ -142,7 +147,7 @@ def test_what_differs_in_its_numbers_only_is_said_once() -> None:
     )
     notes = "\n".join(lay_out(table, None).notes)
     ranges = "9 to 120 points of 2 inputs, 0.25 to 0.5 random (2 cells)"
-    assert f"Given: ours — init: {ranges} / none (1 cells)." in notes
+    assert f"Inputs: ours — init: {ranges} / none (1 cells)." in notes
 
 
 def _layout() -> Layout:

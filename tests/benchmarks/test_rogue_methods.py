@@ -13,11 +13,11 @@ import pandas as pd
 import pytest
 
 from benchmarks.catalogue import Catalogue
-from benchmarks.plan import TableFolder
-from benchmarks.records import Cell
-from benchmarks.results import read_results
-from benchmarks.runner import RunOptions, run_table
-from benchmarks.verify import verify
+from benchmarks.report.aggregate import read_results
+from benchmarks.report.verify import verify
+from benchmarks.run.cell_record import Cell
+from benchmarks.run.plan import TableFolder
+from benchmarks.run_table import RunOptions, run_table
 from tests.benchmarks.rogues import ENDS, HANGS, LEFTOVERS, SOUND, STATE, write_rogues
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="asks /proc for processes")

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.captures import Capture
-from benchmarks.protocol import Draw, draw_sequence
-from benchmarks.scene_writing import prepare_scene
-from benchmarks.scenes import Scene
-from benchmarks.truths import put_away
+from benchmarks.protocol.captures import Capture
+from benchmarks.protocol.draws import Draw, draw_sequence
+from benchmarks.protocol.prepared_scene import Scene, truths_removed
+from benchmarks.protocol.scene_writing import prepare_scene
 from extrap_train.config import RulesConfig
 from extrap_train.errors import InputError
 from extrap_train.metrics import psnr
@@ -53,7 +52,7 @@ def test_a_method_needs_no_file_of_the_truth(draw_and_scene: tuple[Draw, Scene])
     """With the truth out of reach the inputs are still complete, and afterwards it is as it was."""
     _, scene = draw_and_scene
     files = {file: file.read_bytes() for file in scene.truth_folder.rglob("*.*")}
-    with put_away(scene.truth_folder.parent):
+    with truths_removed(scene.truth_folder.parent):
         assert not scene.truth_folder.exists()
         inputs = scene.inputs()
         contents = {f.read_bytes() for f in scene.folder.parents[1].rglob("*") if f.is_file()}
@@ -107,7 +106,7 @@ def test_a_frame_that_the_capture_lacks_is_named(tmp_path: Path) -> None:
 
 
 def test_estimated_depth_is_charged_to_the_method_that_asks() -> None:
-    from benchmarks.recorded_depth import RecordedDepth
+    from benchmarks.protocol.prepared_scene import RecordedDepth
 
     source = RecordedDepth(7.5)
     assert source.seconds == 0

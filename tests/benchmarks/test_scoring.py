@@ -8,9 +8,9 @@ import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio
 
-from benchmarks import scoring
-from benchmarks.scenes import TrueSurface, Truth
-from benchmarks.scoring import megascenes_compat, score_images, score_points
+from benchmarks.protocol.prepared_scene import TrueSurface, Truth
+from benchmarks.score import scoring
+from benchmarks.score.scoring import megascenes_compat, score_images, score_points
 from extrap_train.config import ScoringConfig
 from extrap_train.views import stack_cameras
 from tests.benchmarks.analytic import view_at

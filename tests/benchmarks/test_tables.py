@@ -10,14 +10,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks import making
 from benchmarks.__main__ import main
 from benchmarks.catalogue import Catalogue
-from benchmarks.compare import compare
-from benchmarks.door import let_in
-from benchmarks.plan import cell_jobs, open_protocol
-from benchmarks.results import TIDY, read_results
-from benchmarks.scenes import Scene
+from benchmarks.protocol.prepared_scene import Scene
+from benchmarks.report.aggregate import TIDY, read_results
+from benchmarks.report.compare import compare
+from benchmarks.run import run_method
+from benchmarks.run.method_output import check_output
+from benchmarks.run.plan import cell_jobs, open_protocol
 from extrap_train.errors import InputError
 from extrap_train.jobs.slurm import SubmittedLauncher
 from tests.benchmarks.tables import greys_folder, run_greys
@@ -58,10 +58,13 @@ def test_every_report_is_there(finished: Path) -> None:
 def test_a_cell_says_what_made_it(finished: Path) -> None:
     cells = read_results(greys_folder(finished)).cells
     for cell in cells:
-        assert all(vars(cell.hashes).values())
+        assert cell.device == "cpu"
+        assert cell.made_from.options["factory"] == "grey_method.Grey"
+        assert cell.made_from.options["rules.image_size"] == 24
+        assert set(cell.made_from.inputs) == {"photographs", "weights", "code"}
         assert cell.given == {"init": "none"}
         assert cell.counts == {"greys": 1.0}
-        assert cell.versions["torch"]
+        assert cell.made_from.packages["torch"]
         assert cell.truths_apart
     assert len({cell.key for cell in cells}) == len(cells) == 4
 
@@ -71,7 +74,7 @@ def test_a_second_run_uses_every_cell_again(
 ) -> None:
     stamps = {f: f.stat().st_ino for f in copy.glob("greys/cells/*/*")}
     assert run_greys(own, copy) == 0
-    assert "4 finished and used again, 0 open" in capsys.readouterr().out
+    assert "4 reused, 0 open" in capsys.readouterr().out
     assert {f: f.stat().st_ino for f in copy.glob("greys/cells/*/*")} == stamps
 
 
@@ -134,7 +137,7 @@ def test_a_failed_cell_is_tried_again_and_a_finished_one_not(
     run_greys(own, copy, "methods=[dark,broken]")
     capsys.readouterr()
     run_greys(own, copy, "methods=[dark,broken]")
-    assert "2 finished and used again, 2 open" in capsys.readouterr().out
+    assert "2 reused, 2 open" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("damage", [b"", b"{", b"[]", b'{"key": "other"}', b"bare"])
@@ -147,7 +150,7 @@ def test_a_corrupt_cell_is_announced_and_made_anew(
     assert run_greys(own, copy) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "made again" in said
-    assert "3 finished and used again, 1 open" in said
+    assert "3 reused, 1 open" in said
     pd.testing.assert_frame_equal(_table(copy), _table(finished))
 
 
@@ -157,20 +160,23 @@ def test_a_cell_of_the_cpu_sees_no_gpu_from_its_start(
     """Asking a GPU for its peak memory opens it, and hiding it afterwards changes nothing."""
     seen = []
 
-    class Watched(making.PeakMemory):
+    class Watched(run_method.PeakMemory):
         def __enter__(self) -> "Watched":
             seen.append(os.environ.get("CUDA_VISIBLE_DEVICES"))
             super().__enter__()
             return self
 
-    monkeypatch.setattr(making, "PeakMemory", Watched)
+    monkeypatch.setattr(run_method, "PeakMemory", Watched)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
     folder, catalogue = greys_folder(copy), Catalogue.with_own([str(own)])
     table = catalogue.table("greys", [f"output={copy}", "device=cpu"])
     protocol, _ = open_protocol(table, folder)
     scenes = [Scene.open(path) for path in folder.scenes.glob("*-*")]
-    job = cell_jobs(table, folder, protocol, [catalogue.method("dark")], scenes)[0]
-    assert let_in(making.make(job), 6, 24, "dark").handed.status == "made"
+    config = catalogue.method("dark")
+    methods = {"dark": (config, run_method.build_method(config))}
+    job = cell_jobs(table, folder, protocol, methods, scenes)[0]
+    made = check_output(run_method.run_method(job), 6, 24, "dark")
+    assert made.output.status == "made"
     assert seen == [""]
 
 
@@ -192,7 +198,7 @@ def test_results_of_another_protocol_are_refused(own: Path, copy: Path) -> None:
         run_greys(own, copy, "rules.image_size=16")
     file = next(copy.glob("greys/cells/*/cell.json"))
     record = json.loads(file.read_text())
-    record["hashes"]["protocol"] = "0" * 64
+    record["protocol"] = "0" * 64
     file.write_text(json.dumps(record))
     with pytest.raises(InputError, match="is a result of another protocol"):
         read_results(greys_folder(copy))

@@ -5,8 +5,7 @@ import time
 import torch
 
 from benchmarks.methods.base import Method, Stopwatch
-from benchmarks.methods.references import nearest_inputs
-from benchmarks.methods.untrained import InpaintedWarp, NearestPhoto
+from benchmarks.methods.untrained import InpaintedWarp, NearestPhoto, nearest_inputs
 from extrap_train.metrics import psnr
 from tests.benchmarks.analytic import scene_inputs
 

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from benchmarks.__main__ import main
-from benchmarks.verify import Verification, verify
+from benchmarks.report.verify import Verification, verify
 from extrap_train.errors import InputError
 from tests.benchmarks.tables import greys_folder, run_greys
 
@@ -69,7 +69,7 @@ def test_verify_finds_what_is_left_out_and_what_only_pictures_show(copy: Path) -
     records = [json.loads(file.read_text()) for file in files]
     del records[0]["metrics"]["masked_psnr"]
     records[1]["metrics"]["psnr"]["per_image"][0] += 1
-    records[2]["hashes"]["weights"] = "0" * 64
+    records[2]["made_from"]["inputs"]["weights"] = "0" * 64
     for file, record in zip(files, records, strict=True):
         file.write_text(json.dumps(record))
     table = folder.path / "greys_mean.csv"
@@ -77,7 +77,7 @@ def test_verify_finds_what_is_left_out_and_what_only_pictures_show(copy: Path) -
     said = "\n".join(verify(folder).problems)
     assert "masked_psnr is not stated, computed as" in said
     assert "psnr by image is stated as" in said
-    assert "its name does not follow from the hashes" in said
+    assert "its name does not follow" in said
     assert "greys_mean.csv: is not what the cells say" in said
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from benchmarks.__main__ import main
-from benchmarks.verify import verify
+from benchmarks.report.verify import verify
 from extrap_train.errors import InputError
 from tests.benchmarks.tables import greys_folder
 
@@ -28,16 +28,13 @@ def _cell_of(copy: Path, method: str) -> Path:
 
 def test_a_result_under_another_name_is_noticed(copy: Path) -> None:
     """Everything that is scored stays as it was; only what it is called changes."""
-    light = json.loads(_cell_of(copy, "light").read_text())["options"]
-    relabelled = {"method": "light", "options": light, "n_views": 6, "category": "chair"}
-    file = _cell_of(copy, "dark")
-    _edit(file, lambda cell: cell.update(relabelled, seed=1, device="cuda"))
+    relabelled = {"method": "light", "n_views": 6, "category": "chair"}
+    _edit(_cell_of(copy, "dark"), lambda cell: cell.update(relabelled, seed=1))
     said = "\n".join(verify(greys_folder(copy)).problems)
-    assert "was not made by grey_method.Grey with the options of its row" in said
+    assert "options.level (was 0.2, now 0.6)" in said
     assert "states n_views 6, its photographs are of 3" in said
     assert "states category chair, its photographs are of apple" in said
     assert "states seed 1, its photographs are of 0" in said
-    assert "states the device cuda, made on cpu" in said
     assert "dark on apple-000" in said
     assert "there is no cell of it" in said
     assert "has 2 cells" in said
@@ -45,10 +42,13 @@ def test_a_result_under_another_name_is_noticed(copy: Path) -> None:
 
 def test_options_of_a_row_that_the_images_were_not_made_with_are_noticed(copy: Path) -> None:
     folder = greys_folder(copy)
-    _edit(_cell_of(copy, "dark"), lambda cell: cell["options"].update(level=0.9))
-    assert any("its row has {'level': 0.2" in problem for problem in verify(folder).problems)
-    _edit(folder.plan, lambda plan: plan["methods"]["dark"]["options"].update(level=0.9))
-    assert sum("was not made by" in problem for problem in verify(folder).problems) == 2
+    stated = {"options.level": 0.9}
+    _edit(_cell_of(copy, "dark"), lambda cell: cell["made_from"]["options"].update(stated))
+    said = "\n".join(verify(folder).problems)
+    assert "options.level (was 0.9, now 0.2)" in said
+    assert "its name does not follow" in said
+    _edit(folder.plan, lambda plan: plan["methods"]["dark"]["options"].update(level=0.7))
+    assert sum("options.level" in problem for problem in verify(folder).problems) == 2
     _edit(folder.plan, lambda plan: plan["table"]["options"].update(light={"level": 0.7}))
     said = "\n".join(verify(folder).problems)
     assert "light was not made with the options that its table gives" in said
@@ -103,9 +103,9 @@ def test_a_damaged_plan_is_one_line(
 @pytest.mark.parametrize(
     "edit",
     [
-        lambda cell: cell.update(hashes={}),
-        lambda cell: cell["hashes"].pop("images"),
-        lambda cell: cell.update(hashes=[]),
+        lambda cell: cell.update(made_from={}),
+        lambda cell: cell["made_from"].pop("inputs"),
+        lambda cell: cell.update(scored_from=[]),
         lambda cell: cell.update(images=[]),
         lambda cell: cell.update(images={"../0.png": ""}),
         lambda cell: cell.update(points=3),
@@ -117,7 +117,7 @@ def test_a_damaged_plan_is_one_line(
         lambda cell: cell.update(n_views="3"),
         lambda cell: cell.update(status="fine"),
         lambda cell: cell.update(status=[]),
-        lambda cell: cell.pop("options"),
+        lambda cell: cell.pop("protocol"),
     ],
 )
 def test_a_damaged_cell_is_one_line(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.consistency import (
+from benchmarks.score.view_consistency import (
     neighbour_pairs,
     symmetric_epipolar_distance,
     tsed,

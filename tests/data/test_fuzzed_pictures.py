@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.files import array_of, pictures_of
+from benchmarks.protocol.array_files import array_of, pictures_of
 from extrap_train.data.images import (
     read_depth,
     read_depth_mask,

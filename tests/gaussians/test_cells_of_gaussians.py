@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from benchmarks.catalogue import Catalogue
-from benchmarks.runner import RunOptions, run_table
+from benchmarks.run_table import RunOptions, run_table
 from extrap_train.jobs.local import LocalLauncher
 
 _TABLE = """

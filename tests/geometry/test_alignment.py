@@ -5,8 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from benchmarks.perf.align import NOISES, bumpy_edges, relative_error
-from benchmarks.perf.align_reference import align_by_descent
+from benchmarks.perf.align_timing import NOISES, align_by_descent, bumpy_edges, relative_error
 from extrap_train.geometry.alignment import align_view
 from extrap_train.views import Camera
 

@@ -1,0 +1,102 @@
+"""A diffusion method that paints the targets one after another, each on from those before."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from benchmarks.methods.base import SceneInputs
+from benchmarks.methods.diffusion import Diffusion, Painted, target_names
+from extrap_train.config import CompletionConfig, StereoConfig
+from extrap_train.depth.sources import depth_source
+from extrap_train.diffusion.generator import GeneratedViews, ViewGenerator
+from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.geometry.world_frame import WorldFrame
+from extrap_train.reconstruction.cloud import cloud_of
+from extrap_train.reconstruction.completion import Step, Workshop, complete, map_of_inputs
+from extrap_train.reconstruction.global_map import GENERATED, GlobalMap
+from extrap_train.reconstruction.inputs import first_views, fit_world_frame
+from extrap_train.reconstruction.planner import Query
+from extrap_train.views import Camera, View, stack_cameras
+
+
+@dataclass(frozen=True)
+class IncrementalDiffusion(Diffusion):
+    """The incremental loop with the targets as its queries (paper II-C, METHOD §5).
+
+    Every painted view is given depth, checked against the map, merged, and a reference from then
+    on; the loop chooses the order. Only the inputs' depth is given: that of the painted views is
+    stereo's, whatever source the inputs' came from.
+    """
+
+    def painted(self, model: ExtrapolationModel, inputs: SceneInputs) -> Painted:
+        """Paint and merge every target; beside the images, the points of the whole map."""
+        options = CompletionConfig()
+        unit = fit_world_frame(stack_cameras([view.camera for view in inputs.fine_views]))
+        size = model.config.warp_size
+        views, confidences = first_views(inputs.fine_views, inputs.depth_source, unit, size)
+        known = map_of_inputs(views, confidences, options.tolerance)
+        painter = _Remembering(self.generator(model))
+        workshop = Workshop(painter, depth_source(StereoConfig()), options, inputs.seed)
+        cameras = unit.inside(inputs.targets.squared(size))
+        names = target_names(inputs)
+        queries = [Query(name, cameras[index]) for index, name in enumerate(names)]
+        steps: list[Step] = []
+        known = complete(known, queries, workshop, lambda _, __, step: steps.append(step))
+        agreeing = [s for s in steps if s.agreement >= options.confidence.least_agreement]
+        return Painted(
+            images=_kept(painter, known, names),
+            given={"references": "inputs and painted views", "painted views' depth": "stereo"},
+            points=_points(known, unit, options),
+            counts={
+                "pictures": float(sum(step.attempts for step in steps)),
+                "agreeing_views": float(len(agreeing)),
+            },
+        )
+
+
+@dataclass(frozen=True)
+class _Remembering:
+    """Paints as another generator does and keeps its pictures: the map holds resampled ones."""
+
+    inner: ViewGenerator
+    pictures: dict[tuple[str, int], Float[Tensor, "3 h w"]] = field(default_factory=dict)
+    """By name and seed."""
+
+    @property
+    def image_size(self) -> int:
+        """See `ViewGenerator.image_size`."""
+        return self.inner.image_size
+
+    @property
+    def warp_size(self) -> int:
+        """See `ViewGenerator.warp_size`."""
+        return self.inner.warp_size
+
+    def generate(
+        self, references: Sequence[View], queries: Camera, names: Sequence[str], seed: int = 0
+    ) -> GeneratedViews:
+        """See `ViewGenerator.generate`."""
+        made = self.inner.generate(references, queries, names, seed)
+        self.pictures.update(
+            {(name, seed): image for name, image in zip(names, made.images, strict=True)}
+        )
+        return made
+
+
+def _kept(
+    painter: _Remembering, known: GlobalMap, names: Sequence[str]
+) -> Float[Tensor, "n 3 h w"]:
+    """Of every view the attempt that the map kept, as it was painted."""
+    seeds = {v.view.name: v.origin.seed for v in known.views if v.origin.kind == GENERATED}
+    return torch.stack([painter.pictures[name, seeds[name]] for name in names])
+
+
+def _points(known: GlobalMap, unit: WorldFrame, options: CompletionConfig) -> Float[Tensor, "m 3"]:
+    """The map's points that are sure enough, in the photographs' world."""
+    cloud = cloud_of(known, votes=options.confidence.votes)
+    return unit.points_outside(
+        cloud[cloud.confidence >= options.confidence.least_confidence].points
+    )

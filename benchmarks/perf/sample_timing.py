@@ -1,0 +1,95 @@
+"""Sampling a view with guidance: both predictions in one bfloat16 pass with fused attention,
+against plain float32, one after the other.
+"""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from benchmarks.perf.diffusion_case import (
+    Size,
+    batch_of,
+    compare_and_report,
+    configuration,
+    forward_flops,
+    optimised,
+    plain,
+    run_all,
+)
+from benchmarks.perf.timing import Row
+from extrap_train.config import SamplerConfig
+from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.sampler import ddim_timesteps, sample_ddim, sample_views, view_generator
+from extrap_train.views import PairBatch
+
+_GUIDANCE = 3.0
+_STEPS = {"cpu": 2, "cuda": 50}
+_REPEATS = {"cpu": 3, "cuda": 5}
+Sampling = Callable[[], Float[Tensor, "b 3 h w"]]
+
+
+def run() -> list[Row]:
+    """A row a device and batch size; prints speed and memory.
+
+    On a GPU also with torch.compile, which the validations of a training with trainer.compile=true
+    sample with, and no other task.
+    """
+    return run_all(_compare)
+
+
+def _compare(device: torch.device, size: Size, count: int, compiled: bool) -> Row:
+    config = configuration(size)
+    model, batch = optimised(config, device).eval(), batch_of(count, device)
+    steps = _STEPS[device.type]
+    reference = plain_sampling(plain(model), batch, steps)
+    if compiled:
+        model.unet.compile()
+    ours = sampling(model, batch, steps)
+    case = f"{steps} guided steps, {size.name}, batch {count}{', compiled' if compiled else ''}"
+    flops = 2 * steps * count * forward_flops(config)
+    repeats = _REPEATS[device.type]
+    return compare_and_report(case, device, count, ours, reference, repeats, flops)
+
+
+def sampling(model: ExtrapolationModel, batch: PairBatch, steps: int) -> Sampling:
+    """The product's sampler in mixed precision, the default of every task that paints."""
+    options = SamplerConfig(steps=steps, guidance=_GUIDANCE)
+    device = batch.image.device
+
+    def sample() -> Float[Tensor, "b 3 h w"]:
+        with torch.autocast(device.type, torch.bfloat16):
+            return sample_views(model, batch, options, _names(batch))
+
+    return sample
+
+
+def plain_sampling(model: ExtrapolationModel, batch: PairBatch, steps: int) -> Sampling:
+    """DDIM with guidance as one writes it down: two passes a step."""
+
+    @torch.no_grad()
+    def sample() -> Float[Tensor, "b 3 h w"]:
+        condition = model.condition(batch)
+        null = condition.zeroed(torch.ones_like(condition.token_weight, dtype=torch.bool))
+
+        def denoise(latent: Float[Tensor, "b z h w"], timestep: int) -> Float[Tensor, "b z h w"]:
+            times = torch.full((len(latent),), timestep, device=latent.device)
+            conditional, without = model(latent, times, condition), model(latent, times, null)
+            return without + _GUIDANCE * (conditional - without)
+
+        def draw_noise() -> Float[Tensor, "b z h w"]:
+            generators = [view_generator(0, name) for name in _names(batch)]
+            shape = condition.base.shape[1:]
+            drawn = torch.stack([torch.randn(shape, generator=g) for g in generators])
+            return drawn.to(condition.base)
+
+        timesteps = ddim_timesteps(model.schedule, SamplerConfig(steps=steps))
+        latent = sample_ddim(denoise, model.schedule, timesteps, 0.0, draw_noise)
+        return model.decode_target(latent, condition)
+
+    return sample
+
+
+def _names(batch: PairBatch) -> list[str]:
+    return [str(i) for i in range(len(batch.image))]

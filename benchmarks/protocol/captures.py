@@ -1,0 +1,260 @@
+"""The test captures of a table, whatever they come from; none that a model was trained on."""
+
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.protocol.array_files import read_points
+from benchmarks.protocol.draws import Draw, Protocol, draw_sequence
+from benchmarks.protocol.prepared_scene import TrueSurface
+from data_prep.filter import judge_all
+from data_prep.split import by_hash, split_sequences
+from extrap_train.config import (
+    CapturesConfig,
+    MethodConfig,
+    PrepConfig,
+    RulesConfig,
+    SyntheticConfig,
+)
+from extrap_train.data.co3d import read_category
+from extrap_train.data.json_files import read_json
+from extrap_train.data.photographs import CATEGORY as NO_CATEGORY
+from extrap_train.data.scene import open_scene
+from extrap_train.data.sequences import FrameSequence
+from extrap_train.data.synthetic import build_scene, surface_points
+from extrap_train.data.synthetic.capture import synthetic_sequence
+from extrap_train.data.transforms_json import TRANSFORMS, read_transforms
+from extrap_train.data.validation import require_list
+from extrap_train.errors import InputError
+from extrap_train.store.cache import read_manifest
+from extrap_train.store.manifest import MANIFEST, Split
+from extrap_train.views import stack_poses
+
+CLOUD_POINTS = 20_000
+"""Of the true surface of a rendered scene."""
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A test capture, and its true surface where that is known."""
+
+    sequence: FrameSequence
+    surface: Callable[[], TrueSurface] | None = None
+
+
+@dataclass(frozen=True)
+class TrainedModel:
+    """A method's model whose run records what it was trained on."""
+
+    method: str
+    run: Path
+    category: str
+    split: Split
+
+    def require_unseen(self, captures: Iterable[FrameSequence]) -> None:
+        """InputError for the first capture that the model was trained on.
+
+        By name alone: CO3D's are unique, whatever category a table gives them.
+        """
+        tested = Split("co3d", (), tuple(capture.name for capture in captures))
+        if leaked := tested.leaked_from(self.split):
+            raise InputError(
+                f"options.{self.method}.weights: {self.run} was trained on the capture "
+                f"{leaked[0]}; test on others, or give weights that have not seen it"
+            )
+
+
+def trained_models(
+    methods: Iterable[MethodConfig], categories: Collection[str]
+) -> list[TrainedModel]:
+    """The models of CO3D captures among the methods' `weights` that lie in their runs.
+
+    The catalogue checks which rendered captures models may be tested on.
+    """
+    found = []
+    for method in methods:
+        weights = method.options.get("weights")
+        if not isinstance(weights, str):
+            continue
+        for folder in sorted({weights.replace("{category}", c) for c in categories or [""]}):
+            run = Path(folder).resolve().parent
+            if (run / MANIFEST).is_file():
+                splits = read_manifest(run, "restore it").split
+                found += [TrainedModel(method.name, run, c, split) for c, split in splits.items()]
+    return [model for model in found if model.split.source == "co3d"]
+
+
+def _held_out_by_all(
+    models: Iterable[TrainedModel], category: str, present: Collection[str], count: int
+) -> list[str] | None:
+    """Up to `count` test captures that every model of a category holds out, in the order of a
+    split; None where there is no model of it. Raises InputError where there are none.
+    """
+    models = [model for model in models if model.category == category]
+    if not models:
+        return None
+    common = set(present).intersection(*(model.split.test for model in models))
+    if not common:
+        runs = " and ".join(sorted({str(model.run) for model in models}))
+        raise InputError(
+            f"{category}: none of the {len(present)} captures is held out by {runs}; test on "
+            "other captures, or train with more data.test_sequences"
+        )
+    return sorted(sorted(common, key=lambda name: by_hash(f"{category}/{name}"))[:count])
+
+
+def open_captures(
+    config: CapturesConfig, categories: list[str], models: Sequence[TrainedModel] = ()
+) -> list[Capture]:
+    """The test captures of some categories; nothing is rendered or decoded yet.
+
+    Raises InputError for a capture that one of the `models` was trained on.
+    """
+    captures = _open(config, categories, models)
+    if config.source != "synthetic":
+        for model in models:
+            model.require_unseen(capture.sequence for capture in captures)
+    return captures
+
+
+def _open(
+    config: CapturesConfig, categories: list[str], models: Sequence[TrainedModel]
+) -> list[Capture]:
+    match config.source:
+        case "synthetic":
+            return [
+                _synthetic(config, category, index)
+                for category in categories
+                for index in range(config.sequences)
+            ]
+        case "co3d":
+            return [
+                _with_cloud(s) for category in categories for s in _co3d(config, category, models)
+            ]
+        case "reconfusion":
+            return [_with_cloud(s) for s in _reconfusion(config)]
+        case _:
+            return [_with_cloud(_named(spec, categories)) for spec in config.scenes]
+
+
+def freeze(config: CapturesConfig, rules: RulesConfig, captures: list[Capture]) -> Protocol:
+    """Draw inputs and targets for every capture."""
+    sequences = [capture.sequence for capture in captures]
+    if config.source == "reconfusion":
+        draws = [draw for one in sequences for draw in _given_draws(config, one, rules)]
+    else:
+        draws = [
+            draw
+            for one in sequences
+            for draw in draw_sequence(
+                one.category,
+                one.name,
+                [frame.name for frame in one.frames],
+                stack_poses([frame.camera for frame in one.frames]),
+                rules,
+            )
+        ]
+    return Protocol(rules, tuple(draws))
+
+
+def _synthetic(config: CapturesConfig, category: str, index: int) -> Capture:
+    options = SyntheticConfig(frames=config.frames, image_size=config.render_size, seed=config.seed)
+
+    def surface() -> TrueSurface:
+        found = surface_points(build_scene(category, index, config.seed), CLOUD_POINTS)
+        points = torch.from_numpy(found.points).float()
+        is_object = torch.from_numpy(found.is_object)
+        return TrueSurface(points[is_object], points[~is_object])
+
+    return Capture(synthetic_sequence(category, index, options), surface)
+
+
+def _with_cloud(sequence: FrameSequence) -> Capture:
+    cloud = sequence.point_cloud.find() if sequence.point_cloud else None
+    if cloud is None:
+        return Capture(sequence)
+    return Capture(sequence, lambda: TrueSurface(read_points(cloud), torch.zeros(0, 3)))
+
+
+def _co3d(
+    config: CapturesConfig, category: str, models: Sequence[TrainedModel]
+) -> list[FrameSequence]:
+    """The captures that the models' runs have held out; where no run says so, those that training
+    on the same download with its usual options does.
+    """
+    if config.root is None:
+        raise InputError("captures.source=co3d needs the download: give captures.root=FOLDER")
+    sequences = {f"{s.category}/{s.name}": s for s in read_category(Path(config.root), category)}
+    present = [sequence.name for sequence in sequences.values()]
+    named = _held_out_by_all(models, category, present, config.sequences)
+    if named is not None:
+        return [sequences[f"{category}/{name}"] for name in named]
+    verdicts = judge_all(list(sequences.values()), PrepConfig())
+    kept = [name for name, verdict in zip(sequences, verdicts, strict=True) if verdict.kept]
+    if not kept:
+        reasons = sorted({verdict.reason for verdict in verdicts})[:3]
+        raise InputError(f"{config.root}/{category}: no usable capture ({'; '.join(reasons)})")
+    split = split_sequences(kept, config.sequences)
+    return [sequences[name] for name in (*split.test, *split.lone)]
+
+
+def _reconfusion(config: CapturesConfig) -> list[FrameSequence]:
+    """A folder a scene, as the split's authors hand it out; frames are counted in name order."""
+    if config.root is None:
+        raise InputError("captures.source=reconfusion needs its folder: give captures.root=FOLDER")
+    folders = sorted(file.parent for file in Path(config.root).glob(f"*/{TRANSFORMS}"))
+    if not folders:
+        raise InputError(f"{config.root}: no folder in it has a {TRANSFORMS}; check captures.root")
+    return [replace(read_transforms(f), category="co3d", name=f.name) for f in folders]
+
+
+def _given_draws(config: CapturesConfig, capture: FrameSequence, rules: RulesConfig) -> list[Draw]:
+    """The split files' own choice, `{"train_ids": [...], "test_ids": [...]}`."""
+    draws = []
+    for n_views in rules.views:
+        file = Path(str(config.root)) / capture.name / f"train_test_split_{n_views}.json"
+        content = read_json(file)
+        try:
+            inputs, targets = (
+                _frames_of(capture, require_list(content[key], key, file))
+                for key in ("train_ids", "test_ids")
+            )
+        except (KeyError, IndexError, TypeError, ValueError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(
+                f"{file}: names no frames of {capture.name} ({error!r}); get it again"
+            ) from None
+        if set(inputs) & set(targets):
+            raise InputError(f"{file}: has frames in both train_ids and test_ids; get it again")
+        draws.append(Draw(capture.category, capture.name, n_views, "given", 0, inputs, targets))
+    return draws
+
+
+def _frames_of(capture: FrameSequence, ids: list[Any]) -> tuple[str, ...]:
+    """The names of frames by their places among all that are listed, in the order of names.
+
+    ValueError where those cannot be meant, or where the frame has no picture.
+    """
+    listed, present = sorted(capture.listed), {frame.name for frame in capture.frames}
+    wrong = [i for i in ids if type(i) is not int or not 0 <= i < len(listed)]
+    if wrong:
+        raise ValueError(f"{wrong[0]!r} is no number from 0 to {len(listed) - 1}")
+    if len(set(ids)) < len(ids):
+        raise ValueError("a number stands twice")
+    names = tuple(listed[i] for i in ids)
+    missing = [name for name in names if name not in present]
+    if missing:
+        raise ValueError(f"{missing[0]} is missing or cannot be used")
+    return names
+
+
+def _named(spec: str, categories: list[str]) -> FrameSequence:
+    """A capture that does not know its category takes the table's, if that is only one."""
+    capture = open_scene(spec)
+    if capture.category == NO_CATEGORY and len(categories) == 1:
+        return replace(capture, category=categories[0])
+    return capture

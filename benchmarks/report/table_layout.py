@@ -1,0 +1,224 @@
+"""What a printed table shows, before it is Markdown, LaTeX or HTML."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+
+from benchmarks.report.aggregate import Results
+from benchmarks.report.input_notes import input_notes
+from benchmarks.run.cell_record import OK, one_line
+from benchmarks.score.significance import FEWEST_CAPTURES
+from extrap_train.config import metric_direction
+
+NAMES = {
+    "lpips_alex": "LPIPS (alex)",
+    "lpips_vgg": "LPIPS (vgg)",
+    "lpips_squeeze": "LPIPS (squeeze)",
+    "dists": "DISTS",
+    "masked_psnr": "mPSNR",
+    "masked_ssim": "mSSIM",
+    "psnr": "PSNR",
+    "ssim": "SSIM",
+    "unseen_psnr": "unseen PSNR",
+    "unseen_ssim": "unseen SSIM",
+    "compat_psnr": "MegaScenes' PSNR",
+    "compat_ssim": "MegaScenes' SSIM",
+    "tsed": "TSED",
+    "warp_psnr": "warp PSNR",
+    "accuracy_share": "accuracy",
+    "completeness": "completeness",
+    "f_score": "F-score",
+    "accuracy_distance": "distance",
+    "seconds": "time, s",
+    "lpips": "LPIPS",
+}
+_ARROWS = {1: "↑", -1: "↓", 0: ""}
+_DIGITS = {"psnr": 2, "memory_mib": 0}
+_MAX_NOTE = 4000
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One number of a printed table."""
+
+    text: str
+    value: float | None
+    rank: int | None = None
+    """1 is the best of its column, 2 the second."""
+    ties_best: bool = False
+    """No worse than the best beyond chance (`benchmarks.score.significance`)."""
+    title: str = ""
+    """Interval and count, or why there is no number."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method."""
+
+    label: str
+    group: str
+    entries: list[Entry]
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One printed table: rows over (metric, views)."""
+
+    title: str
+    columns: list[tuple[str, int]]
+    rows: list[Row]
+
+    def headings(self) -> list[str]:
+        """Metric with its arrow and the number of views, per column."""
+        return [f"{name_of(m)} {_ARROWS[metric_direction(m)]} {n} views" for m, n in self.columns]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Every panel, the published numbers apart, and the reasons of what is missing."""
+
+    title: str
+    panels: list[Panel]
+    """By draw over everything, then by category."""
+    reported: Panel | None
+    missing: list[str]
+    """Empty numbers and the cells that have none, with their reasons."""
+    notes: list[str]
+
+
+def name_of(metric: str) -> str:
+    """A metric as a heading."""
+    return NAMES.get(metric, one_line(metric.replace("_", " ")))
+
+
+def lay_out(results: Results, reported: dict[str, Any] | None) -> Layout:
+    """Arrange a table's results; `reported` is a file of published numbers.
+
+    Every text is on one line; each format escapes what means something in it.
+    """
+    name = one_line(results.plan.table.title or results.plan.table.name)
+    panels = []
+    categories = list(dict.fromkeys(cell.category for cell in results.cells))
+    for category in [None, *(categories if len(categories) > 1 else [])]:
+        means = results.means(category)
+        for draw in dict.fromkeys(cell.draw for cell in results.cells):
+            title = one_line(f"{category or name}, {draw} inputs")
+            panels.append(_panel(title, results, means[means["draw"] == draw], category, draw))
+    quick = " (quick: a part of the table)" if results.plan.quick else ""
+    return Layout(
+        title=name + quick,
+        panels=panels,
+        reported=None if reported is None else _reported(reported),
+        missing=[one_line(line, _MAX_NOTE) for line in _missing(results)],
+        notes=[one_line(line, _MAX_NOTE) for line in _notes(results)],
+    )
+
+
+def _panel(
+    title: str, results: Results, means: pd.DataFrame, category: str | None, draw: str
+) -> Panel:
+    cells = [
+        cell for cell in results.cells if cell.draw == draw and category in (None, cell.category)
+    ]
+    views = sorted({cell.n_views for cell in cells})
+    captures = len({(cell.category, cell.sequence) for cell in cells})
+    columns = [(metric, n) for metric in results.plan.table.columns for n in views]
+    known = {(r.method, r.metric, r.n_views): r for r in means.itertuples()}
+    rows = [
+        Row(
+            one_line(entry.title or method),
+            one_line(entry.group),
+            [_entry(known.get((method, *column)), column[0]) for column in columns],
+        )
+        for method, entry in results.methods.items()
+    ]
+    return Panel(f"{title} ({_counted_captures(captures)})", columns, rows)
+
+
+def _counted_captures(count: int) -> str:
+    many = f"{count} capture{'s' if count > 1 else ''}"
+    return many if count >= FEWEST_CAPTURES else f"{many}: too few to tell methods apart"
+
+
+def _entry(mean: Any, metric: str) -> Entry:
+    if mean is None:
+        return Entry("–", None, title="no number: see below")
+    rank = None if pd.isna(mean.rank) else int(mean.rank)
+    lacking = f" ({mean.cells}/{mean.of})" if mean.cells < mean.of else ""
+    return Entry(
+        text=_number(mean.mean, metric) + lacking,
+        value=float(mean.mean),
+        rank=rank,
+        ties_best=rank is not None and rank > 1 and not mean.behind_best,
+        title=_spread(mean, metric),
+    )
+
+
+def _spread(mean: Any, metric: str) -> str:
+    if mean.captures == 1:
+        return f"no interval: a single capture, {mean.cells} cells"
+    low, high = (_number(v, metric) for v in (mean.low, mean.high))
+    return f"95 % interval {low} to {high} over {mean.captures} captures, {mean.cells} cells"
+
+
+def _number(value: float, metric: str) -> str:
+    if metric == "seconds":
+        return f"{value:.3g}"  # a warp takes milliseconds, an optimisation minutes
+    digits = next((d for suffix, d in _DIGITS.items() if metric.endswith(suffix)), 3)
+    return f"{value:.{digits}f}"
+
+
+def _reported(content: dict[str, Any]) -> Panel:
+    """Published numbers, labelled as such and never ranked with ours."""
+    views = sorted({n for row in content["rows"].values() for n in row})
+    columns = [(metric, n) for metric in content["metrics"] for n in views]
+    rows = []
+    for label, by_views in content["rows"].items():
+        values = {
+            (metric, n): value
+            for n, numbers in by_views.items()
+            for metric, value in zip(content["metrics"], numbers, strict=True)
+        }
+        entries = [_stated(values.get(column), column[0]) for column in columns]
+        rows.append(Row(f"{label} (reported)", "", entries))
+    return Panel(f"Reported, not measured here: {content['source']}", columns, rows)
+
+
+def _stated(value: float | None, metric: str) -> Entry:
+    return Entry("–", None) if value is None else Entry(_number(value, metric), value)
+
+
+def _missing(results: Results) -> list[str]:
+    """One line per reason."""
+    reasons: dict[str, list[str]] = {}
+    for cell in results.cells:
+        if cell.status != OK:
+            reasons.setdefault(cell.reason, []).append(f"{cell.method} ({cell.status})")
+            continue
+        for metric, score in cell.metrics.items():
+            if score.value is None:
+                reasons.setdefault(score.reason, []).append(name_of(metric))
+    absent = len(results.plan.cells) - len(results.cells)
+    lines = [
+        f"{', '.join(sorted(set(where)))}: {len(where)} × {reason}"
+        for reason, where in reasons.items()
+    ]
+    return lines + ([f"{absent} cells have not been run yet"] if absent else [])
+
+
+def _notes(results: Results) -> list[str]:
+    times = {entry.title: entry.time for entry in results.methods.values()}
+    protocol, rules = results.plan.protocol, results.plan.table.rules
+    devices = sorted({cell.device for cell in results.cells})
+    return [
+        f"Protocol {protocol[:16]}: {rules.pool} frames by farthest-point sampling, "
+        f"{rules.image_size} × {rules.image_size} px, depth of the inputs: {rules.depth}. "
+        f"Device: {', '.join(devices)}.",
+        "Best bold, second underlined; ° marks what cannot be told from the best (sign-flip test "
+        "of the paired differences over captures, p above 5 %; below "
+        f"{FEWEST_CAPTURES} captures nothing can). A mean that lacks cells says how many it has of "
+        "how many, and is not ranked.",
+        "Time: " + "; ".join(f"{title}: {meaning}" for title, meaning in times.items()) + ".",
+        *input_notes(results),
+    ]

@@ -1,0 +1,1 @@
+"""Running a table: what is planned, what a method makes, and the cells that are kept."""

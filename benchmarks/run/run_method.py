@@ -1,0 +1,158 @@
+"""A method at work, in a process of its own: it is given a scene's inputs, and its output is handed
+over as bytes (`method_output`).
+"""
+
+import importlib
+import json
+import os
+import random
+import traceback
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import numpy as np
+import torch
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+from torch import Tensor
+
+from benchmarks.methods.base import Method, SceneInputs, Stopwatch, Synthesis, Unavailable
+from benchmarks.protocol.prepared_scene import RecordedDepth, Scene
+from benchmarks.run.cell_record import FAILED, MADE, UNAVAILABLE
+from benchmarks.run.cells import CellJob
+from benchmarks.run.method_output import MethodOutput, check_measured, pack_output
+from extrap_train.config import MethodConfig, check_options
+from extrap_train.data.images import to_eight_bits
+from extrap_train.errors import InputError, did_you_mean
+from extrap_train.metrics import require_unit_range
+
+PER_IMAGE = "per image"
+"""`MethodConfig.time` of the methods whose perform time is that of one image."""
+
+
+_STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+_RESET_PEAK = "5"
+
+
+def run_method(job: CellJob) -> bytes:
+    """Run a method on what it may know of a scene; whatever it raises is its status and reason."""
+    torch.set_num_threads(1)  # the same images, however many workers there are
+    if job.device != "cuda":  # before anything asks for a GPU: from then on it is there
+        os.environ["CUDA_VISIBLE_DEVICES"] = ""
+    try:
+        inputs = Scene.open(job.scene).inputs()
+        with PeakMemory() as memory, Stopwatch() as watch:
+            synthesis = _synthesize(job.method, inputs)
+        return _packed(synthesis, inputs, job.method, watch.seconds, memory.mib)
+    except Unavailable as error:
+        return pack_output(MethodOutput(UNAVAILABLE, str(error)))
+    except BaseException as error:  # SystemExit and KeyboardInterrupt are its own, too
+        reason = f"{type(error).__name__}: {error}"
+        return pack_output(MethodOutput(FAILED, reason, traceback.format_exc()))
+
+
+def build_method(config: MethodConfig) -> Method:
+    """The object that `factory` names, with its options; raises InputError for what does not fit.
+
+    The file's own ImportError keeps its traceback only where the file itself is found.
+    """
+    module_name, _, name = config.factory.rpartition(".")
+    try:
+        factory = getattr(importlib.import_module(module_name), name)
+    except (ModuleNotFoundError, AttributeError, ValueError) as error:
+        raise InputError(
+            f"method {config.name}: factory {config.factory} cannot be imported ({error}); is its "
+            "folder given with --config-dir?"
+        ) from None
+    method = factory(**_typed_options(config, factory))
+    if not isinstance(method, Method):
+        raise InputError(
+            f"method {config.name}: {config.factory} has no weight_files() and synthesize(); see "
+            "benchmarks/methods/base.py"
+        )
+    if is_dataclass(method):
+        check_options(method, f"options.{config.name}.")
+    return method
+
+
+def _typed_options(config: MethodConfig, factory: Any) -> dict[str, Any]:
+    """Options as the fields of a dataclass declare them; other classes have none."""
+    known = [f.name for f in fields(factory) if f.init] if is_dataclass(factory) else []
+    hints, values = get_type_hints(factory), {}
+    for name, value in config.options.items():
+        if name not in known:
+            hint = did_you_mean(name, known) if known else "it has none"
+            raise InputError(f"method {config.name}: there is no option {name}; {hint}")
+        kind = TypeAdapter(hints[name], config=ConfigDict(arbitrary_types_allowed=True))
+        try:
+            values[name] = kind.validate_json(json.dumps(value), strict=True)
+        except ValidationError as error:
+            reason = error.errors(include_url=False, include_input=False)[0]["msg"]
+            raise InputError(f"options.{config.name}.{name}={value}: {reason}") from None
+    return values
+
+
+def _synthesize(method: MethodConfig, inputs: SceneInputs) -> Synthesis:
+    for seed in (random.seed, np.random.seed, torch.manual_seed):
+        seed(inputs.seed)
+    return build_method(method).synthesize(inputs)
+
+
+def _packed(
+    synthesis: Synthesis,
+    inputs: SceneInputs,
+    method: MethodConfig,
+    wall_seconds: float,
+    peak_memory_mib: float | None,
+) -> bytes:
+    images, points = synthesis.images, synthesis.points
+    _require_floats(images, f"method {method.name}: images")
+    require_unit_range(images)
+    arrays = {"images": to_eight_bits(images.permute(0, 2, 3, 1))}
+    if points is not None:
+        _require_floats(points, f"method {method.name}: points")
+        arrays["points"] = points.detach().cpu().float().numpy()
+    values = {
+        "seconds": synthesis.seconds + _depth_share(inputs, method),
+        "wall_seconds": wall_seconds,
+        "peak_memory_mib": peak_memory_mib,
+        "given": dict(synthesis.given),
+        "counts": dict(synthesis.counts),
+    }
+    return pack_output(MethodOutput(MADE, measured=check_measured(values, method.name)), arrays)
+
+
+class PeakMemory:
+    """A `with` block's peak in MiB: of the GPU where there is one, else of the process.
+
+    `mib` is None where the system (no Linux) cannot say.
+    """
+
+    mib: float | None = None
+
+    def __enter__(self) -> "PeakMemory":
+        if torch.cuda.is_available():
+            torch.cuda.reset_peak_memory_stats()
+        elif _CLEAR.exists():
+            _CLEAR.write_text(_RESET_PEAK)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if torch.cuda.is_available():
+            self.mib = torch.cuda.max_memory_allocated() / 2**20
+        elif _STATUS.exists():
+            lines = dict(line.split(":", 1) for line in _STATUS.read_text().splitlines())
+            self.mib = float(lines["VmHWM"].split()[0]) / 1024
+
+
+def _require_floats(values: Any, what: str) -> None:
+    if not (isinstance(values, Tensor) and values.is_floating_point()):
+        kind = values.dtype if isinstance(values, Tensor) else type(values).__name__
+        raise InputError(f"{what} must be a tensor of floats, not {kind}")
+
+
+def _depth_share(inputs: SceneInputs, method: MethodConfig) -> float:
+    """What finding the inputs' depth took, for the methods that asked for it."""
+    assert isinstance(inputs.depth_source, RecordedDepth)
+    count = len(inputs.targets.world_to_cam) if method.time == PER_IMAGE else 1
+    return inputs.depth_source.seconds / count

@@ -1,0 +1,213 @@
+"""Run a table: what is missing is made and scored, what is there is used, reports are written."""
+
+import os
+import shutil
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, nullcontext
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from rich.console import Console
+
+from benchmarks.catalogue import Catalogue
+from benchmarks.protocol.prepared_scene import Scene, truths_removed
+from benchmarks.report.aggregate import read_results
+from benchmarks.run.cell_record import FAILED, MADE, OK, Cell, Plan
+from benchmarks.run.cells import CellJob, keep_output, score_cell, write_failure
+from benchmarks.run.dry_run import print_plan
+from benchmarks.run.method_output import check_output
+from benchmarks.run.plan import (
+    TableFolder,
+    cell_jobs,
+    open_jobs,
+    open_protocol,
+    prepare_draws,
+    require_different,
+    selected_draws,
+)
+from benchmarks.run.run_method import build_method, run_method
+from extrap_train.config import TableConfig
+from extrap_train.errors import InputError
+from extrap_train.jobs import Died, Launcher
+from extrap_train.jobs.guests import AsGuest, GuestLauncher
+from extrap_train.jobs.local import LocalLauncher
+from extrap_train.jobs.slurm import slurm_launcher
+from extrap_train.store.atomic import file_lock, remove_leftovers
+from extrap_train.store.records import write_record
+from extrap_train.terminal import progress, terminal
+
+_CELLS_PER_SCORER = 8
+Making = Callable[[Sequence[CellJob]], Iterator[tuple[int, bytes | Died]]]
+"""Runs `run_method` on every job; yields each one's index with its output."""
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """What the command line says beside the table."""
+
+    quick: bool = False
+    dry_run: bool = False
+    workers: int = 0
+    """Processes; 0 takes every core, or one on a GPU."""
+    slurm: bool = False
+    launcher: Launcher | None = None
+    """In place of the above."""
+
+
+def run_table(table: TableConfig, catalogue: Catalogue, options: RunOptions) -> int:
+    """Make every missing cell and the reports; returns how many cells have failed.
+
+    Raises InputError where another run holds the folder, or where the table cannot be made.
+    """
+    folder = TableFolder(Path(table.output) / table.name)
+    with _locked(folder):
+        return _run(table, catalogue, options, folder, terminal())
+
+
+@contextmanager
+def _locked(folder: TableFolder) -> Iterator[None]:
+    """The folder for this process alone, without what killed runs have left in it."""
+    taken = f"{folder.path}: another process runs this table; wait for it or give output=FOLDER"
+    with ExitStack() as held:
+        try:
+            folder.path.mkdir(parents=True, exist_ok=True)
+            held.enter_context(file_lock(folder.path / ".run.lock", taken))
+        except OSError as error:
+            raise InputError(
+                f"{folder.path}: cannot be written ({error.strerror}); choose another output="
+            ) from None
+        remove_leftovers(folder.path)
+        for place in (folder.cells, folder.scenes, folder.truths):
+            for left in filter(Path.is_dir, place.glob(".*")):  # nobody else writes here
+                shutil.rmtree(left)
+        yield
+
+
+def _run(
+    table: TableConfig,
+    catalogue: Catalogue,
+    options: RunOptions,
+    folder: TableFolder,
+    console: Console,
+) -> int:
+    configs = [catalogue.method(name, table.options.get(name)) for name in table.methods]
+    require_different(configs)
+    methods = {config.name: (config, build_method(config)) for config in configs}
+    if not methods:
+        raise InputError("the table has no methods: give methods=[...]")
+    protocol, captures = open_protocol(table, folder, configs)
+    draws = selected_draws(table, protocol, options.quick)
+    scenes: list[Scene] = []
+    with progress("preparing", len(draws), "draws") as bar:
+        for scene in prepare_draws(table, folder, draws, captures):
+            scenes.append(scene)
+            bar.advance()
+    jobs = cell_jobs(table, folder, protocol, methods, scenes)
+    left = open_jobs(jobs, folder, console.print)
+    still = len(left.to_make) + len(left.to_score)
+    console.print(f"{len(jobs)} cells: {len(left.done)} reused, {still} open")
+    if options.dry_run:
+        print_plan(jobs, left, folder, console)
+        return 0
+    plan = Plan(
+        table=table,
+        quick=options.quick,
+        protocol=protocol.sha256,
+        scored_from=jobs[0].scored_from,
+        methods={config.name: config for config in configs},
+        cells=[job.folder.name for job in jobs],
+    )
+    try:
+        with _launchers(options, table, jobs, folder) as (making, scoring):
+            made = _make(left.to_make, making, folder)
+            images = [
+                replace(job, images_from=job.folder)
+                for job, cell in zip(left.to_make, made, strict=True)
+                if cell.images
+            ]
+            scored = _score([*left.to_score, *images], scoring)
+    except KeyboardInterrupt:
+        kept = sum((job.folder / "cell.json").is_file() for job in jobs)
+        raise KeyboardInterrupt(
+            f"{kept} of {len(jobs)} cells are kept in {folder.path}; run the same command again "
+            "to go on"
+        ) from None
+    write_record(folder.plan, plan)
+    return _report(folder, catalogue, [*made, *scored], console)
+
+
+def _make(jobs: Sequence[CellJob], making: Making, folder: TableFolder) -> list[Cell]:
+    """Let the methods make their images, and keep what is sound; a cell per job, in their order."""
+    cells: dict[int, Cell] = {}
+    with (
+        truths_removed(folder.truths) if jobs else nullcontext(),
+        progress("making", len(jobs), "cells") as bar,
+    ):
+        for index, result in making(jobs):
+            job = jobs[index]
+            scene = Scene.open(job.scene)
+            size = scene.record.image_size
+            output = check_output(result, len(scene.draw.targets), size, job.method.name)
+            cells[index] = keep_output(job, output, truths_apart=True)
+            bar.advance(note=f"{job.method.name} {_word(cells[index])}")
+    return [cells[index] for index in range(len(jobs))]
+
+
+def _word(cell: Cell) -> str:
+    return cell.status if cell.status != FAILED else f"failed: {cell.reason}"
+
+
+def _score(jobs: Sequence[CellJob], launcher: Launcher) -> list[Cell]:
+    """Score what is made, and put the cells in their places."""
+    cells = []
+    with progress("scoring", len(jobs), "cells") as bar:
+        for index, result in launcher.run(score_cell, jobs):
+            if isinstance(result, Died):
+                result = write_failure(jobs[index], result.reason)
+            cells.append(result)
+            bar.advance()
+    return cells
+
+
+def _report(
+    folder: TableFolder, catalogue: Catalogue, fresh: Sequence[Cell], console: Console
+) -> int:
+    """Write the reports and print the numbers; returns how many cells have failed."""
+    from benchmarks.report import lay_out_results, numbers, write_reports  # heavy: they draw
+
+    results = read_results(folder)
+    layout = lay_out_results(results, catalogue)
+    written = write_reports(results, layout, folder)
+    console.print(f"\n{numbers(layout, console.width)}\n")
+    problems: dict[str, list[str]] = defaultdict(list)
+    for cell in fresh:
+        if cell.status not in (OK, MADE):
+            problems[cell.reason].append(cell.method)
+    for reason, names in problems.items():
+        console.print(f"{len(names)} cells of {', '.join(sorted(set(names)))}: {reason}")
+    for path in written:
+        console.print(f"written: {path}")
+    console.print(f"result: {folder.path}")
+    return sum(cell.status == FAILED for cell in results.cells)
+
+
+@contextmanager
+def _launchers(
+    options: RunOptions, table: TableConfig, jobs: Sequence[CellJob], folder: TableFolder
+) -> Iterator[tuple[Making, Launcher]]:
+    """What makes images, each cell's in a process of its own, and what scores them."""
+    modules = {job.method.factory.rpartition(".")[0] for job in jobs}
+    ours = sorted(name for name in modules if name.startswith("benchmarks."))
+    preload = ("benchmarks.run.run_method", *ours)
+    if options.launcher is not None or options.slurm:
+        elsewhere = options.launcher or slurm_launcher(table.slurm, folder.path / "slurm")
+        yield partial(elsewhere.run, AsGuest(run_method, table.cell_timeout_s, preload)), elsewhere
+        return
+    cores = 1 if jobs[0].device == "cuda" else len(os.sched_getaffinity(0))
+    workers = options.workers or cores
+    guests = GuestLauncher(workers, table.cell_timeout_s, preload)
+    # A further process loads for as long as it takes to score some cells here.
+    with LocalLauncher(min(workers, 1 + len(jobs) // _CELLS_PER_SCORER)) as local:
+        yield partial(guests.run, run_method), local
