@@ -15,6 +15,7 @@ from extrap_train.config.training import TrainerConfig, ValidationConfig
 TASKS = {
     "category": "prepare a category, train its model, and measure it on held-out sequences",
     "complete": "complete a scene all around: point cloud, views, Gaussians, turntable",
+    "depth": "train the network that gives the views of task=complete their depth",
     "pack": "write a trained model as a packaged one",
     "scene": "adapt a model to one scene (LoRA)",
     "validate": "measure a trained model on held-out sequences",

@@ -74,6 +74,10 @@ class CompletionConfig:
         "what makes new views: the model, or the exact renderer of a synthetic scene",
         known=("model", "exact"),
     )
+    depth_network: str | None = option(
+        None,
+        "weights of task=depth that give generated views their depth; null: the depth source does",
+    )
     confidence: ConfidenceConfig = field(default_factory=ConfidenceConfig)
     splats: SplatsConfig = field(default_factory=SplatsConfig)
     exact_size: int = option(

@@ -11,8 +11,9 @@ from extrap_train.config import CompletionConfig
 from extrap_train.depth import DepthSource
 from extrap_train.diffusion.generator import ViewGenerator
 from extrap_train.geometry.cameras import unproject
+from extrap_train.reconstruction.depth_completion.completed import DepthCompletion
 from extrap_train.reconstruction.global_map import GENERATED, GIVEN, GlobalMap, MapView, Origin
-from extrap_train.reconstruction.new_view import Proposal, propose
+from extrap_train.reconstruction.new_view import Proposal, propose, propose_completed
 from extrap_train.reconstruction.planner import Query, next_query
 from extrap_train.reconstruction.prior import prior_of
 from extrap_train.views import Camera, View, stack_cameras
@@ -46,6 +47,8 @@ class Workshop:
     """Of the generated views."""
     options: CompletionConfig
     seed: int
+    completion: DepthCompletion | None = None
+    """Of the generated views' depth, in place of the source."""
 
 
 def map_of_inputs(
@@ -89,7 +92,12 @@ def add_view(known: GlobalMap, query: Query, workshop: Workshop) -> tuple[Global
     for seed in range(workshop.seed, workshop.seed + tries):
         picture = _picture(known, query, references, workshop.generator, seed)
         clock.took("generate")
-        proposal = propose(known, picture, neighbours, workshop.source, options.confidence)
+        if workshop.completion is None:
+            proposal = propose(known, picture, neighbours, workshop.source, options.confidence)
+        else:
+            proposal = propose_completed(
+                known, picture, neighbours, workshop.completion, options.confidence
+            )
         clock.took("align")
         attempts += 1
         if best is None or proposal.agreement > best[0].agreement:

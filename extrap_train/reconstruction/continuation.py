@@ -28,30 +28,39 @@ def continued_depth(
     known = (depth > 0).numpy().ravel()
     if known.all() or not known.any():
         return depth
-    height, width = depth.shape
-    ties = _ties(image.double().permute(1, 2, 0).numpy())
-    laplacian = (diags_array(ties.sum(1)) - ties).tocsr()
-    inverse = np.zeros(height * width)
-    inverse[known] = 1 / depth.double().numpy().ravel()[known]
-    inside = laplacian[~known]
-    inverse[~known] = spsolve(inside[:, ~known].tocsc(), -inside[:, known] @ inverse[known])
-    filled = np.where(
-        _within_reach(known.reshape(height, width)), 1 / inverse.reshape(height, width), 0
-    )
+    ties = neighbour_ties(image.double().permute(1, 2, 0).numpy() / COLOUR_SCALE)
+    inverse = np.where(known, 1 / np.where(known, depth.double().numpy().ravel(), 1), 0)
+    inverse = extend_harmonically(inverse, known, ties).reshape(depth.shape)
+    filled = np.where(_within_reach(known.reshape(depth.shape)), 1 / inverse, 0)
     return torch.from_numpy(filled).to(depth.dtype)
+
+
+def extend_harmonically(
+    values: Float[np.ndarray, " n"], known: Bool[np.ndarray, " n"], ties: csr_array, leak: float = 0
+) -> Float[np.ndarray, " n"]:
+    """The values with the unknown ones harmonic under the ties; with a leak they fade to 0 far from
+    the known ones, which stay as they are.
+    """
+    laplacian = (diags_array(ties.sum(1) + leak) - ties).tocsr()
+    extended = np.where(known, values, 0)
+    inside = laplacian[~known]
+    extended[~known] = spsolve(inside[:, ~known].tocsc(), -inside[:, known] @ extended[known])
+    return extended
 
 
 def _within_reach(known: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     return distance_transform_edt(~known) <= REACH * max(known.shape)
 
 
-def _ties(image: Float[np.ndarray, "h w 3"]) -> csr_array:
-    """Symmetric weights between horizontal and vertical neighbours."""
+def neighbour_ties(image: Float[np.ndarray, "h w c"]) -> csr_array:
+    """Symmetric weights between horizontal and vertical neighbours, whose values differ by 1 at an
+    edge.
+    """
     height, width, _ = image.shape
     index = np.arange(height * width).reshape(height, width)
     rows, columns, weights = [], [], []
     for one, other in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        difference = np.abs(image[one] - image[other]).max(-1) / COLOUR_SCALE
+        difference = np.abs(image[one] - image[other]).max(-1)
         weight = (np.exp(-(difference**2)) + LEAST_TIE).ravel()
         rows += [index[one].ravel(), index[other].ravel()]
         columns += [index[other].ravel(), index[one].ravel()]

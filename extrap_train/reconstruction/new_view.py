@@ -16,6 +16,7 @@ from extrap_train.geometry.cameras import unproject_to_world
 from extrap_train.geometry.ncc import ncc_consistent
 from extrap_train.reconstruction.agreement import Sight, look_up
 from extrap_train.reconstruction.continuation import continued_depth
+from extrap_train.reconstruction.depth_completion.completed import DepthCompletion
 from extrap_train.reconstruction.global_map import MOST_COMPARED, GlobalMap
 from extrap_train.reconstruction.measurement import (
     Measured,
@@ -29,6 +30,8 @@ from extrap_train.views import Camera, View
 
 CONTINUED_CONFIDENCE = 0.15
 """Of depth that nothing measures."""
+COMPLETED_CONFIDENCE = 0.7
+"""Most of depth that was completed: less than what stereo measures."""
 CONTRADICTED = 0.9
 """Factor on the confidence of a pixel whose two depths differ."""
 AS_SURE = 1e-3
@@ -87,6 +90,36 @@ def propose(
     completed = torch.where(confidence > 0, completed, 0)
     view = replace(picture, depth=completed)
     return Proposal(view, confidence, agreement, measured.usable_edges)
+
+
+def propose_completed(
+    known: GlobalMap,
+    picture: View,
+    indices: Sequence[int],
+    completion: DepthCompletion,
+    options: ConfidenceConfig,
+) -> Proposal:
+    """Give a picture, posed and without depth, its completed depth.
+
+    Where the map is certain its depth stays; elsewhere the completed one enters, as sure as it says
+    and less sure than any photograph. What the map shows only through unobserved space neither
+    confirms the view nor contradicts it.
+    """
+    prior = prior_of(known, picture.camera, indices)
+    found = completion(known, picture, indices)
+    certain = found.certain & prior.mask
+    agrees, testable = ncc_consistent(picture.image, prior.image, certain)
+    agreement = float(agrees.sum() / testable.sum()) if testable.any() else 0.0
+    depth = torch.where(certain, prior.depth, found.depth)
+    confidence = torch.where(certain, prior.confidence, COMPLETED_CONFIDENCE * found.confidence)
+    confidence = torch.where(depth > 0, confidence, 0)
+    if options.reject and agreement < options.least_agreement:
+        confidence = torch.where(certain, confidence, 0)
+    elif options.free_space:
+        seen_through = _seen_through(known, depth, confidence, picture.camera)
+        confidence = torch.where(~certain & seen_through, 0, confidence)
+    depth = torch.where(confidence > 0, depth, 0)
+    return Proposal(replace(picture, depth=depth), confidence, agreement, len(indices))
 
 
 def _agreement(picture: View, prior: Prior, measured: Measured, tolerance: float) -> float:

@@ -27,6 +27,8 @@ from extrap_train.device import advise_on_sampling_memory
 from extrap_train.errors import InputError
 from extrap_train.geometry.world_frame import WorldFrame
 from extrap_train.reconstruction.completion import Step, Workshop, complete, map_of_inputs
+from extrap_train.reconstruction.depth_completion.completed import NetworkCompletion
+from extrap_train.reconstruction.depth_completion.network import load_depth_network
 from extrap_train.reconstruction.exact import ExactDepth, ExactGenerator
 from extrap_train.reconstruction.global_map import GlobalMap, MapView
 from extrap_train.reconstruction.growth import draw_plan
@@ -50,6 +52,7 @@ from extrap_train.reconstruction.pose_check import check_poses
 from extrap_train.reconstruction.viewer import CloudViewer
 from extrap_train.store import Outcome
 from extrap_train.store.cache import claim
+from extrap_train.store.digests import file_digest
 from extrap_train.tasks.completed import Completed, write_completed
 from extrap_train.tasks.scene_inputs import (
     require_space,
@@ -76,8 +79,9 @@ _NOT_PART_OF_THE_MAP = (
     "splats",
     "confidence.votes",
     "confidence.least_confidence",
+    "depth_network",
 )
-"""May differ on resume: what is made of the map once it is whole."""
+"""May differ on resume: what is made of the map once it is whole, and where weights lie."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +105,16 @@ class _Job:
     @property
     def weights(self) -> dict[str, str]:
         """Digests of the weights."""
-        return {} if self.used is None else self.used.inputs()
+        weights = {} if self.used is None else self.used.inputs()
+        if self.depth_network is not None:
+            weights["complete.depth_network"] = file_digest(self.depth_network)
+        return weights
+
+    @property
+    def depth_network(self) -> Path | None:
+        """Weights that give generated views their depth, if not the source does."""
+        path = self.config.complete.depth_network
+        return None if path is None else Path(path)
 
 
 def run(config: TrainConfig) -> Outcome:
@@ -124,6 +137,8 @@ def _job(config: TrainConfig) -> _Job:
         truth = build_scene(sequence.category, int(sequence.name), options.seed)
     elif config.complete.generator == "exact":
         raise InputError("complete.generator=exact renders: it needs scene=synthetic:…")
+    if config.complete.depth_network is not None:
+        load_depth_network(Path(config.complete.depth_network))  # before anything is begun
     inputs = choose_frames(
         sequence.frames, config.inputs, config.input_frames, config.complete.draw, config.seed
     )
@@ -199,7 +214,10 @@ def _workshop(job: _Job) -> Workshop:
     # A generated view brings no depth along.
     own = config.depth
     source = StereoConfig() if isinstance(own, DatasetDepthConfig) else own
-    return Workshop(generator, depth_source(source), config.complete, config.seed)
+    completion = None
+    if job.depth_network is not None:
+        completion = NetworkCompletion(load_depth_network(job.depth_network))
+    return Workshop(generator, depth_source(source), config.complete, config.seed, completion)
 
 
 def _started_map(job: _Job, workshop: Workshop, console: Console) -> GlobalMap:

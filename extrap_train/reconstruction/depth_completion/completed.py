@@ -1,0 +1,100 @@
+"""The depth of a painted view from the network, fitted to what the map knows."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+from extrap_train.geometry.visibility import Ball
+from extrap_train.reconstruction.continuation import extend_harmonically, neighbour_ties
+from extrap_train.reconstruction.depth_completion.network import DepthNetwork
+from extrap_train.reconstruction.depth_completion.observation import observe
+from extrap_train.reconstruction.global_map import GlobalMap
+from extrap_train.views import View, resample_surfaces, stack_cameras
+
+WORKING_SIZE = 128
+"""Side of the pictures that the network is trained on."""
+EDGE = 0.03
+"""Difference of log depth between neighbours that are two surfaces."""
+LEAK = 1e-3
+"""Of the correction at the rim, which fades over about 1/sqrt(LEAK) pixels."""
+LARGEST_CORRECTION = 0.1
+"""Difference of log depth at the rim beyond which the network means another surface."""
+
+
+@dataclass(frozen=True)
+class CompletedDepth:
+    """A view's dense depth before it enters the map."""
+
+    depth: Float[Tensor, "h w"]
+    confidence: Float[Tensor, "h w"]
+    """Probability that the depth is right to within 2 %."""
+    certain: Bool[Tensor, "h w"]
+    """Where the map shows a surface through space that was seen to be empty."""
+
+
+class DepthCompletion(Protocol):
+    """Whatever completes the depth of a painted view; a test's oracle is one, too."""
+
+    def __call__(self, known: GlobalMap, picture: View, indices: Sequence[int]) -> CompletedDepth:
+        """The depth of a picture, of which the map's views `indices` show parts."""
+        ...
+
+
+@dataclass(frozen=True)
+class NetworkCompletion:
+    """The network's answer, corrected so that it meets the map where that is certain."""
+
+    network: DepthNetwork
+
+    @torch.inference_mode()
+    def __call__(self, known: GlobalMap, picture: View, indices: Sequence[int]) -> CompletedDepth:
+        """See `DepthCompletion`."""
+        views = [known.views[index] for index in indices]
+        size = (WORKING_SIZE, WORKING_SIZE)
+        image = functional.interpolate(picture.image[None], size, mode="area")
+        cameras = stack_cameras([view.camera for view in views])
+        seen = observe(
+            image,
+            stack_cameras([picture.camera.resized(*size)]),
+            torch.stack([view.view.image for view in views])[None],
+            torch.stack([view.depth for view in views])[None],
+            torch.stack([view.confidence for view in views])[None],
+            stack_cameras([cameras]),
+            Ball.around(known.cameras),
+        )
+        log_depth, confidence = self.network(seen.features).best()
+        fitted = fit_to_known(log_depth[0], seen.warp_log_depth[0], seen.certain[0])
+        maps = torch.stack(
+            [seen.depth(fitted[None])[0], confidence[0], seen.certain[0].to(confidence.dtype)]
+        )
+        height, width = picture.camera.height, picture.camera.width
+        if (height, width) != size:
+            maps = resample_surfaces(maps, (height, width))
+        return CompletedDepth(maps[0], maps[1].clamp(0, 1), maps[2] > 0.5)
+
+
+def fit_to_known(
+    log_depth: Float[Tensor, "h w"],
+    known_log_depth: Float[Tensor, "h w"],
+    certain: Bool[Tensor, "h w"],
+) -> Float[Tensor, "h w"]:
+    """What is certain, and beyond it the network's depth moved by what it is off by at the rim.
+
+    The correction is carried along the network's own surfaces and fades with the distance.
+    """
+    off = torch.where(certain, known_log_depth - log_depth, 0)
+    fits = certain & (off.abs() < LARGEST_CORRECTION)
+    if not fits.any() or fits.all():
+        return torch.where(certain, known_log_depth, log_depth)
+    ties = neighbour_ties(log_depth.double().numpy()[..., None] / EDGE)
+    extended = extend_harmonically(
+        off.double().numpy().ravel(), fits.numpy().ravel(), ties, LEAK
+    ).reshape(off.shape)
+    moved = log_depth + torch.from_numpy(np.ascontiguousarray(extended)).to(log_depth.dtype)
+    return torch.where(certain, known_log_depth, moved)

@@ -1,0 +1,145 @@
+"""Training of the depth network on examples that lie on disk."""
+
+import pickle
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.optim import AdamW
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+
+from extrap_train.config import TrainerConfig
+from extrap_train.errors import InputError
+from extrap_train.reconstruction.depth_completion.examples import DepthExamples
+from extrap_train.reconstruction.depth_completion.network import WIDTHS, DepthMixture, DepthNetwork
+from extrap_train.reconstruction.depth_completion.observation import CHANNELS
+from extrap_train.store.atomic import atomic_file, save_array
+
+LEARNING_RATE = 1e-3
+WEIGHT_DECAY = 0.01
+LARGEST_GRADIENT = 1.0
+_DAMAGE = (
+    pickle.UnpicklingError, RuntimeError, OSError, EOFError, ValueError, LookupError, TypeError,
+)  # fmt: skip
+"""What torch raises on files that are cut off or none of its own."""
+_TRUTH, _WEIGHT = CHANNELS, CHANNELS + 1
+
+
+def save_examples(examples: DepthExamples, path: Path) -> None:
+    """Write one capture's examples in half precision, ready to be mapped into memory."""
+    maps = [examples.seen.features, examples.log_depth[:, None], examples.weight[:, None]]
+    with atomic_file(path) as temporary:
+        save_array(temporary, torch.cat(maps, 1).half().numpy())
+
+
+@dataclass(frozen=True)
+class StoredExamples:
+    """The examples of several captures."""
+
+    files: Sequence[Path]
+
+    def batch(self, size: int, rng: np.random.Generator) -> Float[Tensor, "b c h w"]:
+        """Random examples, half of them mirrored: features, true log depth, weight."""
+        chosen = []
+        for _ in range(size):
+            capture = np.load(self.files[int(rng.integers(len(self.files)))], mmap_mode="r")
+            example = np.asarray(capture[rng.integers(len(capture))], np.float32)
+            if rng.random() < 0.5:
+                example = np.ascontiguousarray(example[..., ::-1])
+                example[CHANNELS - 2] *= -1  # the column
+            chosen.append(torch.from_numpy(example))
+        return torch.stack(chosen)
+
+    def captures(self) -> Iterator[Float[Tensor, "b c h w"]]:
+        """All examples, capture by capture."""
+        for file in self.files:
+            yield torch.from_numpy(np.load(file).astype(np.float32))
+
+
+def loss_of(network: Callable[[Tensor], DepthMixture], batch: Float[Tensor, "b c h w"]) -> Tensor:
+    """Weighted mean of the negative log-likelihood of the true log depth."""
+    weight = batch[:, _WEIGHT]
+    unlikely = network(batch[:, :CHANNELS]).negative_log_likelihood(batch[:, _TRUTH])
+    return (weight * unlikely).sum() / weight.sum().clamp(min=1)
+
+
+class DepthTraining:
+    """A network, its running average and its optimiser; the same steps wherever it was resumed."""
+
+    def __init__(self, options: TrainerConfig, seed: int, widths: tuple[int, ...] = WIDTHS) -> None:
+        torch.manual_seed(seed)
+        self.options, self.seed, self.step, self.widths = options, seed, 0, widths
+        self.network = DepthNetwork(widths)
+        self.average = AveragedModel(
+            self.network, multi_avg_fn=get_ema_multi_avg_fn(options.ema_decay)
+        )
+        self.optimizer = AdamW(
+            self.network.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY
+        )
+
+    def advance(self, examples: StoredExamples) -> float:
+        """Take one step; returns its loss."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = LEARNING_RATE * self._rate()
+        rng = np.random.default_rng((self.seed, self.step))
+        loss = loss_of(self.network, examples.batch(self.options.batch_size, rng))
+        self.optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), LARGEST_GRADIENT)
+        self.optimizer.step()
+        self.average.update_parameters(self.network)
+        self.step += 1
+        return float(loss.detach())
+
+    def _rate(self) -> float:
+        """Share of the full learning rate: a linear rise, then 1/sqrt(step) from
+        `full_rate_steps` on.
+        """
+        rise = (self.step + 1) / max(1, self.options.warmup_steps)
+        fall = (self.options.full_rate_steps / max(1, self.step)) ** 0.5
+        return min(1.0, rise, fall)
+
+    def averaged_network(self) -> DepthNetwork:
+        """A copy of the running average."""
+        network = DepthNetwork(self.widths)
+        network.load_state_dict(self.average.module.state_dict())
+        return network.eval()
+
+    def save(self, path: Path) -> None:
+        """Write everything that `load` needs."""
+        with atomic_file(path) as temporary:
+            torch.save(
+                {
+                    "step": self.step,
+                    "network": self.network.state_dict(),
+                    "average": self.average.state_dict(),
+                    "optimizer": self.optimizer.state_dict(),
+                },
+                temporary,
+            )
+
+    def load(self, path: Path) -> None:
+        """Go on from a checkpoint; InputError if it is damaged."""
+        try:
+            state = torch.load(path, weights_only=True)
+            self.step = int(state["step"])
+            self.network.load_state_dict(state["network"])
+            self.average.load_state_dict(state["average"])
+            self.optimizer.load_state_dict(state["optimizer"])
+        except (
+            pickle.UnpicklingError,
+            RuntimeError,
+            OSError,
+            EOFError,
+            ValueError,
+            LookupError,
+            TypeError,
+        ) as error:
+            reason = f"{type(error).__name__} {error}".splitlines()[0]
+            raise InputError(
+                f"{path}: cannot be resumed from ({reason}); delete it to train from the start"
+            ) from None

@@ -1,0 +1,131 @@
+"""`task=depth`: train the network that gives painted views their depth."""
+
+import json
+from collections.abc import Iterable
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from extrap_train.config import SyntheticConfig, TrainConfig, dotted
+from extrap_train.data.synthetic import build_scene, render
+from extrap_train.data.synthetic.capture import handheld_orbit, sequence_name, walk_seed
+from extrap_train.diffusion.generator import DiffusionGenerator
+from extrap_train.diffusion.packaged import packaged_name
+from extrap_train.errors import InputError
+from extrap_train.reconstruction.depth_completion.calibration import DepthScores, calibrate
+from extrap_train.reconstruction.depth_completion.examples import draw_examples
+from extrap_train.reconstruction.depth_completion.network import save_depth_network
+from extrap_train.reconstruction.depth_completion.training import (
+    DepthTraining,
+    StoredExamples,
+    save_examples,
+)
+from extrap_train.store import Outcome
+from extrap_train.store.atomic import write_atomic
+from extrap_train.store.cache import claim
+from extrap_train.store.manifest import Manifest
+from extrap_train.tasks.scene_model import open_model
+from extrap_train.terminal import progress, terminal
+
+EXAMPLES_PER_CAPTURE = 16
+_TRAINER_OPTIONS = ("batch_size", "warmup_steps", "full_rate_steps", "ema_decay")
+"""What a run depends on; steps and checkpoints may change when it is continued."""
+
+
+def run(config: TrainConfig) -> Outcome:
+    """Draw the examples that are missing, train, and write `depth_network.safetensors`.
+
+    A second run resumes after the last checkpoint; more `data.train_sequences` are added to what
+    is there.
+    """
+    data = config.data
+    if not isinstance(data, SyntheticConfig):
+        raise InputError(
+            f"data={data.name}: task=depth needs captures whose depth is known everywhere; use "
+            "data=synthetic"
+        )
+    folder = Path(config.output) / "depth" / (config.run or config.category.name)
+    with claim(folder, _manifest(config), resume=config.resume) as claimed:
+        if not claimed.is_reused:
+            claimed.begin()
+        held_out = range(data.test_sequences)
+        learnt = range(data.test_sequences, data.test_sequences + data.train_sequences)
+        _draw_missing(config, data, folder, [*held_out, *learnt])
+        training = DepthTraining(config.trainer, config.seed)
+        checkpoint, console = folder / "checkpoint.pt", terminal()
+        if checkpoint.is_file():
+            training.load(checkpoint)
+            console.print(f"resuming at step {training.step}: {folder}")
+        before = training.step
+        _train(training, _stored(config, folder, learnt), checkpoint)
+        network = training.averaged_network()
+        scores = calibrate(network, _stored(config, folder, held_out).captures())
+        save_depth_network(network, folder / "depth_network.safetensors")
+        summary = {"steps": training.step, "held_out": asdict(scores)}
+        write_atomic(folder / "summary.json", (json.dumps(summary, indent=1) + "\n").encode())
+        _print_scores(scores, folder, console)
+    return Outcome(folder, is_reused=training.step == before)
+
+
+def _manifest(config: TrainConfig) -> Manifest:
+    options = dotted({"category": asdict(config.category), "data": asdict(config.data)})
+    del options["data.train_sequences"]  # a run may be continued with more captures
+    trainer = {f"trainer.{name}": getattr(config.trainer, name) for name in _TRAINER_OPTIONS}
+    return Manifest.of(options | trainer | {"seed": config.seed})
+
+
+def _example_file(folder: Path, category: str, index: int) -> Path:
+    return folder / "examples" / f"{category}-{sequence_name(index)}.npy"
+
+
+def _stored(config: TrainConfig, folder: Path, indices: Iterable[int]) -> StoredExamples:
+    members = config.category.members
+    return StoredExamples([_example_file(folder, c, i) for i in indices for c in members])
+
+
+def _draw_missing(
+    config: TrainConfig, data: SyntheticConfig, folder: Path, indices: list[int]
+) -> None:
+    """Draw the examples of every capture that has no file yet, with the packaged painters."""
+    wanted = [(member, index) for index in indices for member in config.category.members]
+    missing = [pair for pair in wanted if not _example_file(folder, *pair).is_file()]
+    painters = {member: _painter(member) for member in {member for member, _ in missing}}
+    with progress("drawing examples", len(missing), "captures") as bar:
+        for category, index in missing:
+            scene, walk = build_scene(category, index, data.seed), (category, index, data.seed)
+            cameras = handheld_orbit(scene, data.frames, data.image_size, walk_seed(*walk))
+            views = [render(scene, cameras[i], supersample=1) for i in range(data.frames)]
+            rng = np.random.default_rng((config.seed, walk_seed(*walk)))
+            examples = draw_examples(views, painters[category], EXAMPLES_PER_CAPTURE, rng)
+            save_examples(examples, _example_file(folder, category, index))
+            bar.advance()
+
+
+def _painter(category: str) -> DiffusionGenerator:
+    model = open_model(packaged_name("ours", category))
+    return DiffusionGenerator(model, model.config.sampler)
+
+
+def _train(training: DepthTraining, examples: StoredExamples, checkpoint: Path) -> None:
+    options = training.options
+    left = max(0, options.steps - training.step)
+    losses: list[float] = []
+    with progress("training", left, "steps") as bar:
+        for _ in range(left):
+            losses.append(training.advance(examples))
+            bar.advance()
+            if training.step % options.checkpoint_every == 0 or training.step == options.steps:
+                training.save(checkpoint)
+                with checkpoint.with_name("loss.csv").open("a") as curve:
+                    curve.write(f"{training.step},{np.mean(losses):.4f}\n")
+                losses.clear()
+
+
+def _print_scores(scores: DepthScores, folder: Path, console: Console) -> None:
+    console.print(
+        f"held-out captures, object pixels that no reference shows for certain: median error "
+        f"{scores.median_error:.1%}, {scores.within:.0%} within 2 %; of the {scores.said:.0%} said "
+        f"to be within 2 %, {scores.said_and_within:.0%} are\nresult: {folder}"
+    )

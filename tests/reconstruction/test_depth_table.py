@@ -1,0 +1,146 @@
+"""What the depth of painted views is worth to the completed scene, and how good that depth is.
+
+`python -m pytest -s -m slow tests/reconstruction/test_depth_table.py` prints the tables of
+docs/completion.md: six categories, captures of another seed than any that a model was trained or a
+default chosen on, three one-sided inputs with exact depth, pictures of the packaged models.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+
+from extrap_train.config import CompletionConfig, StereoConfig, SyntheticConfig
+from extrap_train.data.scene import open_scene
+from extrap_train.data.sequences import Frame
+from extrap_train.data.synthetic import SyntheticScene, build_scene, trace
+from extrap_train.depth.stereo import PlaneSweepStereo
+from extrap_train.diffusion.generator import DiffusionGenerator
+from extrap_train.geometry.viewpoints import directions_from, scene_center
+from extrap_train.reconstruction.cloud import cloud_of
+from extrap_train.reconstruction.completion import Workshop, complete, map_of_inputs
+from extrap_train.reconstruction.depth_completion.completed import (
+    CompletedDepth,
+    DepthCompletion,
+)
+from extrap_train.reconstruction.exact import ExactDepth
+from extrap_train.reconstruction.global_map import GENERATED, GlobalMap
+from extrap_train.reconstruction.inputs import WorldUnit, choose_frames, first_views, world_unit
+from extrap_train.reconstruction.planner import orbit_queries
+from extrap_train.reconstruction.prior import prior_of
+from extrap_train.reconstruction.report import cloud_scores
+from extrap_train.tasks.completed import SUBDIVIDE
+from extrap_train.tasks.scene_model import open_model
+from extrap_train.views import View, stack_cameras, stack_poses
+
+CATEGORIES = ("apple", "book", "chair", "cup", "hydrant", "teddybear")
+CAPTURES = SyntheticConfig(seed=917, frames=24, image_size=128)
+NUMBERS = (4, 5, 6, 7)
+WITHIN = 0.02
+ANGLES_DEG = (60, 110, 180)
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A scene with its inputs in the map."""
+
+    scene: SyntheticScene
+    unit: WorldUnit
+    inputs: GlobalMap
+    painter: DiffusionGenerator
+
+    @classmethod
+    def open(cls, category: str, number: int) -> "Capture":
+        scene = build_scene(category, number, CAPTURES.seed)
+        frames = open_scene(f"synthetic:{category}/{number:04d}", CAPTURES).frames
+        chosen: list[Frame] = [frames[i] for i in choose_frames(frames, 3, (), "one_sided", 0)]
+        unit = world_unit(stack_poses([frame.camera for frame in chosen]))
+        model = open_model(f"ours-{category}")
+        painter = DiffusionGenerator(model, model.config.sampler)
+        photographs = [frame.load() for frame in chosen]
+        views, sure = first_views(photographs, ExactDepth(scene, unit), unit, painter.warp_size)
+        return cls(scene, unit, map_of_inputs(views, sure, CompletionConfig().tolerance), painter)
+
+    def truth(self, view: View) -> tuple[torch.Tensor, torch.Tensor]:
+        """Depth in the map's unit, and the object's mask."""
+        depth, mask = trace(self.scene, self.unit.outside(view.camera))
+        return depth / self.unit.unit, mask > 0.5
+
+    def completed(self, completion: DepthCompletion | None) -> GlobalMap:
+        workshop = Workshop(
+            self.painter, PlaneSweepStereo(StereoConfig()), CompletionConfig(), 0, completion
+        )
+        queries = orbit_queries(self.inputs.cameras, np.radians(30))
+        return complete(self.inputs, queries, workshop, lambda *_: None)
+
+    def scores(self, known: GlobalMap) -> dict[str, float]:
+        cloud = cloud_of(known, votes=True, subdivide=SUBDIVIDE)
+        cloud = cloud[cloud.confidence >= CompletionConfig().confidence.least_confidence]
+        return cloud_scores({"": cloud}, self.scene, self.unit)[""]
+
+
+@dataclass(frozen=True)
+class ExactCompletion:
+    """The oracle: true depth, whatever the picture shows."""
+
+    capture: Capture
+
+    def __call__(self, known: GlobalMap, picture: View, indices: Sequence[int]) -> CompletedDepth:
+        depth, _ = self.capture.truth(picture)
+        prior = prior_of(known, picture.camera, indices)
+        return CompletedDepth(depth, (depth > 0).float(), (prior.depth / depth - 1).abs() < WITHIN)
+
+
+def generated_errors(capture: Capture, known: GlobalMap) -> list[tuple[float, np.ndarray]]:
+    """Angle to the nearest input; relative error and confidence of the object's pixels that no
+    input shows, of every generated view."""
+    center = scene_center(known.cameras)
+    towards = directions_from(capture.inputs.cameras, center)
+    found = []
+    for view in known.views:
+        if view.origin.kind != GENERATED:
+            continue
+        direction = directions_from(stack_cameras([view.camera]), center)[0]
+        angle_deg = float(np.degrees(np.arccos((towards @ direction).max().clip(-1, 1))))
+        depth, mask = capture.truth(view.view)
+        hidden = mask & ~shown_by(capture.inputs, replace(view.view, depth=depth))
+        error = torch.where(view.depth > 0, (view.depth / depth - 1).abs(), 1)[hidden]
+        found.append((angle_deg, torch.stack([error, view.confidence[hidden]]).numpy()))
+    return found
+
+
+def shown_by(known: GlobalMap, view: View) -> torch.Tensor:
+    """Pixels of the view's surface that some view of the map shows."""
+    _, added = known.added(view, torch.ones_like(view.depth), known.views[0].origin)
+    return ~added.fresh
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("is_exact", [False, True], ids=["stereo", "exact"])
+def test_what_exact_depth_at_birth_is_worth(is_exact: bool) -> None:
+    rows, errors = [], []
+    for category in CATEGORIES:
+        for number in NUMBERS:
+            capture = Capture.open(category, number)
+            known = capture.completed(ExactCompletion(capture) if is_exact else None)
+            found = capture.scores(known)
+            rows.append([found[name] for name in ("accuracy", "completeness", "f_score")])
+            errors += generated_errors(capture, known)
+            print(f"\n{category} {number}: " + " / ".join(f"{value:.3f}" for value in rows[-1]))
+    means = np.mean(rows, 0)
+    print("mean: " + " / ".join(f"{value:.3f}" for value in means))
+    for low, high in pairwise((0, *ANGLES_DEG)):
+        within = [pixels for angle_deg, pixels in errors if low < angle_deg <= high]
+        if within:
+            error, confidence = np.concatenate(within, 1)
+            said = confidence >= 0.5
+            print(
+                f"{low}° to {high}°: median error {np.median(error):.4f}, within 2 % "
+                f"{(error < WITHIN).mean():.2f}; of the {said.mean():.2f} with a confidence of at "
+                f"least .5, {(error[said] < WITHIN).mean():.2f}"
+            )
+    if is_exact:
+        assert means[2] > 0.9
