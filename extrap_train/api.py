@@ -71,7 +71,8 @@ def open_generator(
 
     `config` describes a published checkpoint, which does not say itself what it is. Without
     `sampler` it samples as the model recommends. It runs where and in what the commands do: on the
-    GPU where there is one, in `bf16-mixed`. Raises InputError for weights that cannot be used.
+    GPU where there is one, in bfloat16 where the processor has units for it. Raises InputError for
+    weights that cannot be used.
     """
     model = open_model(weights, adapter, config).to(device or fastest_device())
     return DiffusionGenerator(model, sampler or model.config.sampler, precision=precision)

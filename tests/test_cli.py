@@ -63,7 +63,7 @@ def _error(arguments: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
         ),
         (["category=hydrant", "model.patch=0"], "model.patch=0: must be from 1"),
         (["category=hydrant", "model.unet.channels=[30,60]"], "need multiples of 16"),
-        (["category=hydrant", "trainer.precision=half"], "known: 32-true, bf16-mixed"),
+        (["category=hydrant", "trainer.precision=half"], "known: auto, 32-true"),
         (["category=hydrant", "~prep.image_size"], "prep.image_size"),
         (["hydrant"], "did you mean category=hydrant?"),
         (["-m", "category=hydrnt,apple"], "did you mean hydrant"),

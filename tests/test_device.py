@@ -1,4 +1,4 @@
-"""Running out of memory says what helps."""
+"""Precision follows the processor; running out of memory says what helps."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from extrap_train.config import TrainerConfig
-from extrap_train.device import advise_on_training_memory
+from extrap_train.device import advise_on_training_memory, resolve_precision
 from extrap_train.errors import InputError
 
 _OPTIONS = TrainerConfig(batch_size=2, precision="32-true")
@@ -36,3 +36,22 @@ def test_out_of_memory_names_two_options(options: TrainerConfig, helps: str) -> 
 def test_other_errors_pass() -> None:
     with pytest.raises(RuntimeError, match="shape"), advise_on_training_memory(_OPTIONS):
         raise RuntimeError("shape")
+
+
+@pytest.mark.parametrize(
+    ("avx512_bf16", "amx", "expected"),
+    [
+        (False, False, "32-true"),
+        (True, False, "bf16-mixed"),
+        (False, True, "bf16-mixed"),
+    ],
+)
+def test_auto_takes_bfloat16_only_where_a_cpu_has_units_for_it(
+    avx512_bf16: bool, amx: bool, expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: avx512_bf16)
+    monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: amx)
+    assert resolve_precision("auto", torch.device("cpu")) == expected
+    assert resolve_precision("auto", torch.device("mps")) == "32-true"
+    for given in ("32-true", "16-mixed", "bf16-mixed"):
+        assert resolve_precision(given, torch.device("cpu")) == given

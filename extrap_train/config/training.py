@@ -37,9 +37,10 @@ class TrainerConfig:
         high=0.999999,
     )
     precision: str = option(
-        "bf16-mixed",
-        "Lightning's precision; weights stay in single precision",
-        known=("32-true", "bf16-mixed", "16-mixed"),
+        "auto",
+        "Lightning's precision; weights stay in single precision; auto: bf16-mixed where the "
+        "processor has units for it, else 32-true",
+        known=("auto", "32-true", "bf16-mixed", "16-mixed"),
     )
     gradient_checkpointing: bool = option(
         False, "compute the denoiser's activations twice: less memory, more time"

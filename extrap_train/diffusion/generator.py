@@ -68,7 +68,7 @@ class DiffusionGenerator:
     references: int | None = None
     """Most views that a query is warped from; None takes the model's number."""
     precision: str = "32-true"
-    """What the network computes in, by the names of `trainer.precision`: `bf16-mixed` is faster."""
+    """What the network computes in, by the names of `trainer.precision`."""
 
     @property
     def image_size(self) -> int:

@@ -17,7 +17,11 @@ from rich.console import Console
 from extrap_train.config import TrainConfig, resolve_paths
 from extrap_train.data.module import PairModule
 from extrap_train.data.prepared import PreparedData
-from extrap_train.device import advise_on_training_memory, require_accelerator
+from extrap_train.device import (
+    advise_on_training_memory,
+    require_accelerator,
+    trainer_precision,
+)
 from extrap_train.diffusion.callbacks import AveragedWeights, MetricsTable, StepProgress
 from extrap_train.diffusion.checkpoint import initial_model, save_model
 from extrap_train.diffusion.model import ExtrapolationModel, use_channels_last
@@ -223,7 +227,7 @@ def _trainer(
     return lightning.Trainer(
         accelerator=options.accelerator,
         devices=options.devices,
-        precision=cast(Any, options.precision),
+        precision=cast(Any, trainer_precision(options)),
         max_steps=options.steps,
         max_epochs=-1,
         check_val_every_n_epoch=max(1, options.validate_every // kept.every),

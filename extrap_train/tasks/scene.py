@@ -17,7 +17,7 @@ from extrap_train.data.scene import scene_address
 from extrap_train.data.scene_pairs import AdaptationPairs, adaptation_pairs
 from extrap_train.data.scene_views import target_views
 from extrap_train.data.sequences import Frame, FrameSequence
-from extrap_train.device import advise_on_adapting_memory
+from extrap_train.device import advise_on_adapting_memory, trainer_precision
 from extrap_train.diffusion.adaptation import Adaptation, adapt
 from extrap_train.diffusion.evaluation import score_images, summarise
 from extrap_train.diffusion.generator import GeneratedViews
@@ -155,7 +155,7 @@ def _lpips_digest(config: TrainConfig) -> dict[str, str]:
 
 def _fabric(config: TrainConfig) -> Fabric:
     """Device and precision of the training."""
-    precision: Any = config.trainer.precision
+    precision: Any = trainer_precision(config.trainer)
     return Fabric(accelerator=config.trainer.accelerator, devices=1, precision=precision)
 
 

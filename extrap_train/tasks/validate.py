@@ -10,7 +10,7 @@ import lightning
 
 from extrap_train.config import TrainConfig, dotted, sampler_for
 from extrap_train.data.prepared import PreparedData
-from extrap_train.device import require_accelerator
+from extrap_train.device import require_accelerator, trainer_precision
 from extrap_train.diffusion.checkpoint import load_model, saved_config
 from extrap_train.diffusion.model import ExtrapolationModel, use_channels_last
 from extrap_train.diffusion.training import CategoryTraining
@@ -105,7 +105,7 @@ def _validator(config: TrainConfig) -> lightning.Trainer:
     return lightning.Trainer(
         accelerator=config.trainer.accelerator,
         devices=1,
-        precision=cast(Any, config.trainer.precision),
+        precision=cast(Any, trainer_precision(config.trainer)),
         logger=False,
         enable_checkpointing=False,
         enable_progress_bar=False,

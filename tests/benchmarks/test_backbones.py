@@ -139,4 +139,4 @@ def test_verification_judges_with_the_very_weights_or_says_that_it_did_not(
     assert main(["verify", str(folder.path), option]) == 1
     assert "lpips_squeeze is stated as" in capsys.readouterr().err
     assert main(["verify", str(folder.path), "rules.pool=9"]) == 1
-    assert "takes scoring.lpips_weights.NET=FILE alone" in capsys.readouterr().err
+    assert "scoring.lpips_weights.NET=FILE" in capsys.readouterr().err

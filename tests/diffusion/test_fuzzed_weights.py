@@ -210,7 +210,7 @@ def _measured(read: Callable[[], Any], sender: Any) -> None:
         said = "read"
     except InputError as error:
         said = "refused" if "\n" not in str(error) else f"several lines: {error}"
-    except BaseException as error:  # noqa: BLE001: anything else would be a traceback
+    except BaseException as error:  # anything else would be a traceback
         said = f"{type(error).__name__}: {error}"[:300]
     peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     sender.send((said, time.process_time() - began, peak))

@@ -61,7 +61,7 @@ def test_the_readmes_walk_and_method() -> None:
     walk, method = _blocks("README.md")
     made = _run(walk)
     assert made["images"].shape == (24, 3, 64, 64)
-    assert made["generator"].precision == "bf16-mixed"
+    assert made["generator"].precision == "auto"
     assert _run(method)["Average"]().weight_files("hydrant") == ()
 
 
