@@ -72,5 +72,5 @@ def test_weights_stay_in_single_precision(precision: str) -> None:
     register_schemas()
     with hydra.initialize_config_module("conf", version_base="1.3"):
         composed = hydra.compose("train", ["category=hydrant", f"trainer.precision={precision}"])
-    with pytest.raises(InputError, match="known: 32-true, bf16-mixed, 16-mixed"):
+    with pytest.raises(InputError, match="known: auto, 32-true, bf16-mixed, 16-mixed"):
         typed_config(composed)

@@ -20,6 +20,7 @@ from extrap_train.data.synthetic import SyntheticScene, build_scene, trace
 from extrap_train.depth.stereo import PlaneSweepStereo
 from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.geometry.viewpoints import directions_from, scene_center
+from extrap_train.geometry.world_frame import WorldFrame
 from extrap_train.reconstruction.cloud import cloud_of
 from extrap_train.reconstruction.completion import Workshop, complete, map_of_inputs
 from extrap_train.reconstruction.depth_completion.completed import (
@@ -28,7 +29,7 @@ from extrap_train.reconstruction.depth_completion.completed import (
 )
 from extrap_train.reconstruction.exact import ExactDepth
 from extrap_train.reconstruction.global_map import GENERATED, GlobalMap
-from extrap_train.reconstruction.inputs import WorldUnit, choose_frames, first_views, world_unit
+from extrap_train.reconstruction.inputs import choose_frames, first_views, fit_world_frame
 from extrap_train.reconstruction.planner import orbit_queries
 from extrap_train.reconstruction.prior import prior_of
 from extrap_train.reconstruction.report import cloud_scores
@@ -48,7 +49,7 @@ class Capture:
     """A scene with its inputs in the map."""
 
     scene: SyntheticScene
-    unit: WorldUnit
+    world: WorldFrame
     inputs: GlobalMap
     painter: DiffusionGenerator
 
@@ -57,17 +58,17 @@ class Capture:
         scene = build_scene(category, number, CAPTURES.seed)
         frames = open_scene(f"synthetic:{category}/{number:04d}", CAPTURES).frames
         chosen: list[Frame] = [frames[i] for i in choose_frames(frames, 3, (), "one_sided", 0)]
-        unit = world_unit(stack_poses([frame.camera for frame in chosen]))
+        world = fit_world_frame(stack_poses([frame.camera for frame in chosen]))
         model = open_model(f"ours-{category}")
         painter = DiffusionGenerator(model, model.config.sampler)
         photographs = [frame.load() for frame in chosen]
-        views, sure = first_views(photographs, ExactDepth(scene, unit), unit, painter.warp_size)
-        return cls(scene, unit, map_of_inputs(views, sure, CompletionConfig().tolerance), painter)
+        views, sure = first_views(photographs, ExactDepth(scene, world), world, painter.warp_size)
+        return cls(scene, world, map_of_inputs(views, sure, CompletionConfig().tolerance), painter)
 
     def truth(self, view: View) -> tuple[torch.Tensor, torch.Tensor]:
         """Depth in the map's unit, and the object's mask."""
-        depth, mask = trace(self.scene, self.unit.outside(view.camera))
-        return depth / self.unit.unit, mask > 0.5
+        depth, mask = trace(self.scene, self.world.outside(view.camera))
+        return depth / self.world.unit, mask > 0.5
 
     def completed(self, completion: DepthCompletion | None) -> GlobalMap:
         workshop = Workshop(
@@ -79,7 +80,7 @@ class Capture:
     def scores(self, known: GlobalMap) -> dict[str, float]:
         cloud = cloud_of(known, votes=True, subdivide=SUBDIVIDE)
         cloud = cloud[cloud.confidence >= CompletionConfig().confidence.least_confidence]
-        return cloud_scores({"": cloud}, self.scene, self.unit)[""]
+        return cloud_scores({"": cloud}, self.scene, self.world)[""]
 
 
 @dataclass(frozen=True)
