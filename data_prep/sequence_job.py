@@ -101,9 +101,9 @@ class SequenceJob:
 def prepare_sequence(job: SequenceJob) -> str:
     """Make the frames and pairs that are missing; returns why the sequence cannot be used, or "".
 
-    Whatever goes wrong with one sequence stays with it, bugs included, whose trace is logged. A
-    full disk is raised, and MemoryError where memory ends, a GPU's or the machine's: other
-    processes may have held it, so the launcher tries again.
+    An error costs its sequence alone, even if it is a bug; a bug's traceback is logged. A full disk
+    is raised, and MemoryError where memory ends, a GPU's or the machine's: other processes may have
+    held it, so the launcher tries again.
     """
     try:
         _prepare(job)

@@ -73,8 +73,8 @@ class Diffusion:
         """InputError for options that exclude each other."""
         if (self.references or 1) > 1 and self.family in NEAREST_ALONE:
             raise InputError(
-                f"references={self.references}, but {self.family} is told of the nearest input "
-                "alone: leave references= out"
+                f"references={self.references}, but {self.family} is conditioned on the "
+                "nearest input alone: leave references= out"
             )
 
     def sampler(self, model: ExtrapolationModel) -> SamplerConfig:

@@ -34,13 +34,13 @@ class IncrementalDiffusion(Diffusion):
     def painted(self, model: ExtrapolationModel, inputs: SceneInputs) -> Painted:
         """Paint and merge every target; beside the images, the points of the whole map."""
         options = CompletionConfig()
-        unit = fit_world_frame(stack_cameras([view.camera for view in inputs.fine_views]))
+        world = fit_world_frame(stack_cameras([view.camera for view in inputs.fine_views]))
         size = model.config.warp_size
-        views, confidences = first_views(inputs.fine_views, inputs.depth_source, unit, size)
+        views, confidences = first_views(inputs.fine_views, inputs.depth_source, world, size)
         known = map_of_inputs(views, confidences, options.tolerance)
         painter = _Remembering(self.generator(model))
         workshop = Workshop(painter, depth_source(StereoConfig()), options, inputs.seed)
-        cameras = unit.inside(inputs.targets.squared(size))
+        cameras = world.inside(inputs.targets.squared(size))
         names = target_names(inputs)
         queries = [Query(name, cameras[index]) for index, name in enumerate(names)]
         steps: list[Step] = []
@@ -49,7 +49,7 @@ class IncrementalDiffusion(Diffusion):
         return Painted(
             images=_kept(painter, known, names),
             given={"references": "inputs and painted views", "painted views' depth": "stereo"},
-            points=_points(known, unit, options),
+            points=_points(known, world, options),
             counts={
                 "pictures": float(sum(step.attempts for step in steps)),
                 "agreeing_views": float(len(agreeing)),
@@ -94,9 +94,9 @@ def _kept(
     return torch.stack([painter.pictures[name, seeds[name]] for name in names])
 
 
-def _points(known: GlobalMap, unit: WorldFrame, options: CompletionConfig) -> Float[Tensor, "m 3"]:
+def _points(known: GlobalMap, world: WorldFrame, options: CompletionConfig) -> Float[Tensor, "m 3"]:
     """The map's points that are sure enough, in the photographs' world."""
     cloud = cloud_of(known, votes=options.confidence.votes)
-    return unit.points_outside(
+    return world.points_outside(
         cloud[cloud.confidence >= options.confidence.least_confidence].points
     )

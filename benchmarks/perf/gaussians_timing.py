@@ -21,7 +21,7 @@ COUNTS = (10_000, 50_000)
 SPACING_TO_SCALE = 0.55
 """Standard deviation of a Gaussian, in mean distances to the nearest neighbour."""
 _MEAN_SPACING = 0.554
-"""Mean distance to the nearest of random points whose density is 1."""
+"""Mean distance between nearest neighbours among random points of density 1."""
 _REPEATS = 3
 """The reference takes seconds."""
 TILE = 16

@@ -134,7 +134,7 @@ def noise_schedule(config: ModelConfig) -> DDIMScheduler:
     """1000 steps, `scaled_linear` as in ZeroNVS (METHOD section 3).
 
     With zero terminal SNR (Lin et al. 2023) the last step is pure noise, so sampling starts where
-    training ended ("trailing"); an ε-prediction says nothing there, hence it is refused.
+    training ended ("trailing"); an ε-prediction carries no information there and is refused.
     """
     if config.zero_terminal_snr and config.prediction == "epsilon":
         raise ValueError(

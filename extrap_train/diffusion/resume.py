@@ -8,7 +8,7 @@ import signal
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -80,7 +80,7 @@ class WholeCheckpointIO(TorchCheckpointIO):
         return loaded
 
 
-def find_damage(path: Path) -> str | None:
+def find_damage(path: Path, entries: Mapping[str, type] = _ENTRIES) -> str | None:
     """What is wrong with a checkpoint: a checksum, its format, or an entry that it lacks.
 
     Reads the file once; its tensors are not kept in memory.
@@ -98,7 +98,7 @@ def find_damage(path: Path) -> str | None:
         return f"{type(error).__name__} {error}".splitlines()[0]
     if not isinstance(found, dict):
         return "it holds no mapping"
-    odd = [name for name, kind in _ENTRIES.items() if not isinstance(found.get(name), kind)]
+    odd = [name for name, kind in entries.items() if not isinstance(found.get(name), kind)]
     if not odd and any(name in found for name in _AVERAGE):
         odd = [name for name in _AVERAGE if not isinstance(found.get(name), dict)]
     return f"no {odd[0]}" if odd else None

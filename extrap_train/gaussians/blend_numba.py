@@ -165,7 +165,7 @@ def _blend_tile(
 def _blend_block(
     pixels: np.ndarray, ellipse: np.ndarray, center: tuple[float, float], overlap: int
 ) -> None:
-    """Blend an ellipse, whose mean is given from the block's first pixel on, into the block."""
+    """Blend an ellipse into the block; `center` is its mean relative to the first pixel."""
     u, v, number = pixels.dtype.type(center[0]), pixels.dtype.type(center[1]), np.float32(overlap)
     precision, slope = ellipse[PRECISION], ellipse[SLOPE]
     precision_v, log = ellipse[PRECISION_V], ellipse[LOG_OPACITY]

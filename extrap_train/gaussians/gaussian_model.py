@@ -44,7 +44,7 @@ class Gaussians:
 
 
 def rgb_to_sh(rgb: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-    """The degree-0 coefficient whose colour is `rgb`."""
+    """The degree-0 coefficient that gives the colour `rgb`."""
     return (rgb - 0.5) / SH_DC
 
 

@@ -97,7 +97,7 @@ def random_points(cameras: Sequence[Camera], count: int, generator: torch.Genera
 def pixel_points(
     view: View, depth_map: DepthMap, wanted: Bool[Tensor, "h w"] | None = None
 ) -> Points:
-    """One point a pixel whose depth is reliable (and wanted)."""
+    """One point per pixel of reliable depth, of those that are wanted."""
     known = depth_map.reliable() > 0
     if wanted is not None:
         known = known & wanted

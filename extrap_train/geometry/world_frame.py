@@ -1,5 +1,5 @@
-"""A world whose origin is the scene's centre and whose unit fits it: thresholds mean the same
-whatever the unit and origin of the photographs' poses.
+"""A normalised world, centred on the scene: thresholds mean the same whatever unit and origin the
+photographs' poses have.
 """
 
 from dataclasses import dataclass, replace

@@ -23,7 +23,7 @@ class ExactGenerator:
 
     scene: SyntheticScene
     image_size: int
-    unit: WorldFrame
+    world: WorldFrame
     """Of the map that views and queries belong to."""
 
     @property
@@ -43,7 +43,7 @@ class ExactGenerator:
 
     def photograph(self, camera: Camera) -> Float[Tensor, "3 h w"]:
         """The picture that a camera in the map's world would take."""
-        return render(self.scene, self.unit.outside(camera)).image
+        return render(self.scene, self.world.outside(camera)).image
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class ExactDepth:
     """A `DepthSource` that measures the scene; what a view's picture shows does not matter."""
 
     scene: SyntheticScene
-    unit: WorldFrame
+    world: WorldFrame
     """Of the map that the views belong to."""
 
     @property
@@ -62,7 +62,7 @@ class ExactDepth:
         """The true depth; the neighbours are not looked at."""
         depth = view.depth
         if depth is None:
-            depth = trace(self.scene, self.unit.outside(view.camera))[0] / self.unit.unit
+            depth = trace(self.scene, self.world.outside(view.camera))[0] / self.world.unit
         return DepthMap(depth, (depth > 0).to(depth.dtype))
 
     def depth_maps(self, views: Sequence[View]) -> list[DepthMap]:

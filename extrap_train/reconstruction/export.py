@@ -38,7 +38,7 @@ def write_cloud(cloud: PointCloud, path: Path) -> None:
     write_atomic(path, content.getvalue())
 
 
-def write_views(known: GlobalMap, unit: WorldFrame, folder: Path) -> None:
+def write_views(known: GlobalMap, world: WorldFrame, folder: Path) -> None:
     """Write every view's picture, depth and confidence under `views/`, and `transforms.json`.
 
     Depth is in units of `DEPTH_UNIT`.
@@ -46,21 +46,21 @@ def write_views(known: GlobalMap, unit: WorldFrame, folder: Path) -> None:
     entries = []
     for stem, view in zip(_stems(known), known.views, strict=True):
         save_picture(view.view.image, folder / "views" / f"{stem}.png")
-        _write_array(view.depth * unit.unit / DEPTH_UNIT, folder / "views" / f"{stem}.depth.npy")
+        _write_array(view.depth * world.unit / DEPTH_UNIT, folder / "views" / f"{stem}.depth.npy")
         _write_array(view.confidence, folder / "views" / f"{stem}.confidence.npy")
-        entries.append(_entry(view, stem, unit.outside(view.camera)))
+        entries.append(_entry(view, stem, world.outside(view.camera)))
     content = {"camera_model": "PINHOLE", "ply_file_path": "cloud.ply", "frames": entries}
     write_atomic(folder / "transforms.json", (json.dumps(content, indent=1) + "\n").encode())
 
 
-def write_colmap(known: GlobalMap, unit: WorldFrame, cloud: PointCloud, folder: Path) -> None:
+def write_colmap(known: GlobalMap, world: WorldFrame, cloud: PointCloud, folder: Path) -> None:
     """Write a COLMAP text model to `colmap/sparse/0`, with `colmap/images` leading to `views/`.
 
     `cloud` is in the photographs' world; its points have no tracks.
     """
     cameras, images = [], []
     for number, (stem, view) in enumerate(zip(_stems(known), known.views, strict=True), 1):
-        camera = unit.outside(view.camera)
+        camera = world.outside(view.camera)
         k = camera.intrinsics.double()
         lens = " ".join(repr(float(x)) for x in (k[0, 0], k[1, 1], k[0, 2], k[1, 2]))
         cameras.append(f"{number} PINHOLE {camera.width} {camera.height} {lens}")

@@ -136,7 +136,7 @@ def _check_lens(camera: Camera, name: str) -> None:
 
 
 def first_views(
-    photographs: Sequence[View], source: DepthSource, unit: WorldFrame, size: int
+    photographs: Sequence[View], source: DepthSource, world: WorldFrame, size: int
 ) -> tuple[list[View], list[Float[Tensor, "s s"]]]:
     """The photographs as squares of `size` pixels in the map's world, with depth and confidence.
 
@@ -147,7 +147,7 @@ def first_views(
     squares = [
         photo.squared(min(side, photo.camera.height, photo.camera.width)) for photo in photographs
     ]
-    scaled = [unit.view_inside(view) for view in squares]
+    scaled = [world.view_inside(view) for view in squares]
     views, confidences = [], []
     for view, found in zip(scaled, source.depth_maps(scaled), strict=True):
         reliable = found.reliable()

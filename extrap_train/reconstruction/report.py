@@ -29,7 +29,7 @@ SEEN_WITHIN_RAD = np.radians(20)
 
 
 def cloud_scores(
-    clouds: dict[str, PointCloud], scene: SyntheticScene, unit: WorldFrame
+    clouds: dict[str, PointCloud], scene: SyntheticScene, world: WorldFrame
 ) -> dict[str, dict[str, float]]:
     """3-D scores of some clouds (in the map's world) of a synthetic scene, by name."""
     truth = surface_points(scene, TRUTH_POINTS)
@@ -37,7 +37,7 @@ def cloud_scores(
     size = float((target.max(0) - target.min(0)).max())
     scores: dict[str, dict[str, float]] = {}
     for name, cloud in clouds.items():
-        points = cloud.points.double().numpy() * unit.unit + unit.center.double().numpy()
+        points = cloud.points.double().numpy() * world.unit + world.center.double().numpy()
         found: CloudScores = score_cloud(points, target, around, TOLERANCE * size)
         scores[name] = asdict(found)
     return scores

@@ -3,7 +3,7 @@
 import json
 import subprocess
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -94,10 +94,6 @@ class Manifest:
             for category in self.split.keys() & seen.split.keys()
         }
         return {category: names for category, names in sorted(found.items()) if names}
-
-    def as_dict(self) -> dict[str, Any]:
-        """The manifest as JSON holds it, for a summary's provenance."""
-        return asdict(self)
 
 
 def _input_change(before: str | None, now: str | None) -> str:

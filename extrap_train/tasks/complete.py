@@ -93,7 +93,7 @@ class _Job:
     truth: SyntheticScene | None
     folder: Path
     inputs: list[int]
-    unit: WorldFrame
+    world: WorldFrame
     used: UsedWeights | None
     """None where the views are rendered."""
 
@@ -188,7 +188,7 @@ def _run(job: _Job, console: Console) -> bool:
             "inputs": load_input_seconds(job.folder / "map"),
             "views": sum(sum(step.seconds.values()) for step in steps),
         }
-        done = Completed(known, steps, job.unit, job.truth, seconds)
+        done = Completed(known, steps, job.world, job.truth, seconds)
         write_completed(done, job.config, job.sequence, workshop, job.used, job.folder, console)
     return not missing
 
@@ -205,8 +205,8 @@ def _workshop(job: _Job) -> Workshop:
         assert job.truth is not None
         scene = job.truth
         return Workshop(
-            ExactGenerator(scene, config.complete.exact_size, job.unit),
-            ExactDepth(scene, job.unit),
+            ExactGenerator(scene, config.complete.exact_size, job.world),
+            ExactDepth(scene, job.world),
             config.complete,
             config.seed,
         )
@@ -234,7 +234,7 @@ def _started_map(job: _Job, workshop: Workshop, console: Console) -> GlobalMap:
     brought = source.image_size is None
     photographs = [frame.load(depth=brought) for frame in job.photographs]
     check_poses(photographs)
-    views, confidences = first_views(photographs, source, job.unit, size)
+    views, confidences = first_views(photographs, source, job.world, size)
     known = map_of_inputs(views, confidences, job.config.complete.tolerance)
     save_input_seconds(time.perf_counter() - started, folder)
     for index, view in enumerate(known.views):
@@ -262,7 +262,7 @@ def _queries(job: _Job, known: GlobalMap) -> list[Query]:
         return orbit_queries(given, np.radians(job.config.complete.step_deg))
     size = known.views[0].camera.width
     others = [frame for i, frame in enumerate(job.sequence.frames) if i not in job.inputs]
-    queries = [Query(frame.name, job.unit.inside(frame.camera.squared(size))) for frame in others]
+    queries = [Query(frame.name, job.world.inside(frame.camera.squared(size))) for frame in others]
     return [q for q in queries if not stand_where(q.camera, given, np.zeros(3)).any()]
 
 

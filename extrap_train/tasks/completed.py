@@ -53,7 +53,7 @@ class Completed:
 
     known: GlobalMap
     steps: Sequence[Step]
-    unit: WorldFrame
+    world: WorldFrame
     truth: SyntheticScene | None
     seconds: dict[str, float]
     """Of the inputs and the views, whichever run made them."""
@@ -74,10 +74,10 @@ def write_completed(
         cloud_of(done.known, votes=config.complete.confidence.votes, subdivide=SUBDIVIDE),
         config.complete.confidence.least_confidence,
     )
-    outside = replace(cloud, points=done.unit.points_outside(cloud.points))
+    outside = replace(cloud, points=done.world.points_outside(cloud.points))
     write_cloud(outside, folder / "cloud.ply")
-    write_views(done.known, done.unit, folder)
-    write_colmap(done.known, done.unit, outside, folder)
+    write_views(done.known, done.world, folder)
+    write_colmap(done.known, done.world, outside, folder)
     draw_growth(done.known, cloud, folder / "growth.png")
     draw_turntable(done.known, cloud, folder / "turntable.mp4")
     _draw_views(done.known, folder / "views.png")
@@ -149,7 +149,7 @@ def _splats(
     if not options.fit:
         return None, {}
     try:
-        return write_fitted_splats(done.known, done.unit, options, config.seed, folder), {}
+        return write_fitted_splats(done.known, done.world, options, config.seed, folder), {}
     except Diverged as error:
         return None, {"splats": str(error)}
 
@@ -169,7 +169,7 @@ def _metrics(done: Completed, cloud: PointCloud) -> dict[str, dict[str, float]] 
     given = _count(done.known, GIVEN)
     only = replace(done.known, views=done.known.views[:given])
     inputs = cloud_of(only, votes=False, subdivide=SUBDIVIDE)
-    return cloud_scores({"inputs": inputs, "completed": cloud}, done.truth, done.unit)
+    return cloud_scores({"inputs": inputs, "completed": cloud}, done.truth, done.world)
 
 
 def _draw_views(known: GlobalMap, path: Path) -> None:
@@ -190,12 +190,12 @@ def _compare_held_out(
     """Views generated at the poses of photographs that were no inputs, against these."""
     given = done.known.views[: _count(done.known, GIVEN)]
     known = {view.view.name for view in given} | set(frames_learnt(config, sequence.frames))
-    frames = _held_out(given, done.unit, sequence, known)[: config.complete.held_out]
+    frames = _held_out(given, done.world, sequence, known)[: config.complete.held_out]
     if not frames or config.complete.generator == "exact":
         return None, {}
     size = workshop.generator.image_size
     truth = [frame.load(depth=False).squared(size) for frame in frames]
-    cameras = [done.unit.inside(view.camera) for view in truth]
+    cameras = [done.world.inside(view.camera) for view in truth]
     made, warps, masks = [], [], []
     only = GlobalMap(done.known.tolerance, given)
     for view, camera in zip(truth, cameras, strict=True):
@@ -236,11 +236,11 @@ def _compare_held_out(
 
 
 def _held_out(
-    given: Sequence[MapView], unit: WorldFrame, sequence: FrameSequence, known: Collection[str]
+    given: Sequence[MapView], world: WorldFrame, sequence: FrameSequence, known: Collection[str]
 ) -> list[Frame]:
     """The frames that are not known, and were not taken from where an input was."""
-    inputs = stack_cameras([unit.outside(view.camera) for view in given])
-    center = unit.center.double().numpy()
+    inputs = stack_cameras([world.outside(view.camera) for view in given])
+    center = world.center.double().numpy()
     return [
         frame
         for frame in sequence.frames

@@ -26,7 +26,7 @@ from extrap_train.views import View
 
 
 def write_fitted_splats(
-    known: GlobalMap, unit: WorldFrame, options: SplatsConfig, seed: int, folder: Path
+    known: GlobalMap, world: WorldFrame, options: SplatsConfig, seed: int, folder: Path
 ) -> dict[str, float]:
     """Fit 3DGS to all views of the map, in the photographs' world, from the views' own depth.
 
@@ -35,7 +35,7 @@ def write_fitted_splats(
     show of the views, and the seconds that fitting took (0: used again). `Diverged` where fitting
     fails.
     """
-    views = [_outside(each.view, unit) for each in known.views]
+    views = [_outside(each.view, world) for each in known.views]
     gaussian_options = GaussianOptions(
         iterations=options.iterations,
         init="dense",
@@ -51,7 +51,7 @@ def write_fitted_splats(
     seconds = time.perf_counter() - started if fresh else 0.0
     splats = read_splats(path)
     truth = torch.stack([view.image for view in views])
-    drawn = quantised(_drawn(_inside(splats, unit), known, gaussian_options))
+    drawn = quantised(_drawn(_inside(splats, world), known, gaussian_options))
     contact_sheet(
         {"view": truth, "splats": drawn, "error": error_map(drawn, truth)}, folder / "splats.png"
     )
@@ -59,10 +59,10 @@ def write_fitted_splats(
     return {"gaussians": float(len(splats)), "psnr": score, "seconds": seconds}
 
 
-def _outside(view: View, unit: WorldFrame) -> View:
+def _outside(view: View, world: WorldFrame) -> View:
     """A view of the map in the photographs' world."""
     assert view.depth is not None
-    return replace(view, camera=unit.outside(view.camera), depth=view.depth * unit.unit)
+    return replace(view, camera=world.outside(view.camera), depth=view.depth * world.unit)
 
 
 def _mark(views: list[View], options: GaussianOptions, seed: int) -> str:
@@ -83,10 +83,10 @@ def _is_marked(path: Path, mark: str) -> bool:
         return False
 
 
-def _inside(splats: Gaussians, unit: WorldFrame) -> Gaussians:
+def _inside(splats: Gaussians, world: WorldFrame) -> Gaussians:
     """Gaussians of the photographs' world in the map's, whose unit suits the near plane."""
-    means = (splats.means - unit.center.to(splats.means)) / unit.unit
-    return replace(splats, means=means, scales=splats.scales / unit.unit)
+    means = (splats.means - world.center.to(splats.means)) / world.unit
+    return replace(splats, means=means, scales=splats.scales / world.unit)
 
 
 @torch.no_grad()

@@ -100,10 +100,10 @@ class _DepthOfThePicture:
 def _accuracy(spoil: Spoil, stubborn: bool, handling: ConfidenceConfig) -> dict[str, float]:
     sequence, scene = open_scene("synthetic:hydrant/0001"), build_scene("hydrant", 1, 0)
     frames = [sequence.frames[i] for i in choose_frames(sequence.frames, 3, [], "one_sided", 0)]
-    unit = fit_world_frame(stack_poses([frame.camera for frame in frames]))
-    exact = ExactGenerator(scene, _SIZE, unit)
-    measured = ExactDepth(scene, unit)
-    views, confidences = first_views([f.load() for f in frames], measured, unit, _SIZE)
+    world = fit_world_frame(stack_poses([frame.camera for frame in frames]))
+    exact = ExactGenerator(scene, _SIZE, world)
+    measured = ExactDepth(scene, world)
+    views, confidences = first_views([f.load() for f in frames], measured, world, _SIZE)
     options = CompletionConfig(confidence=handling)
     known = map_of_inputs(views, confidences, options.tolerance)
     queries = orbit_queries(known.cameras, np.radians(30))
@@ -117,7 +117,7 @@ def _accuracy(spoil: Spoil, stubborn: bool, handling: ConfidenceConfig) -> dict[
     grown = complete(known, queries, workshop, lambda *_: None)
     cloud = cloud_of(grown, votes=handling.votes)
     cloud = cloud[cloud.confidence >= handling.least_confidence]
-    return cloud_scores({"": cloud}, scene, unit)[""]
+    return cloud_scores({"": cloud}, scene, world)[""]
 
 
 @pytest.mark.slow

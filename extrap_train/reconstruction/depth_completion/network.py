@@ -1,4 +1,4 @@
-"""A small network that says the depth of a view, and how sure it is.
+"""A small network that predicts the depth of a view and how sure it is.
 
 A pixel at an edge shows one of two surfaces, never their mean: each pixel has a mixture of two
 Laplace distributions over log depth, and the more likely mode is the answer (Tosi et al., SMD-Nets:

@@ -1,6 +1,5 @@
 """Training of the depth network on examples that lie on disk."""
 
-import pickle
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,8 @@ from torch.optim import AdamW
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from extrap_train.config import TrainerConfig
+from extrap_train.diffusion.resume import WholeCheckpointIO, find_damage
+from extrap_train.diffusion.training import rate_at
 from extrap_train.errors import InputError
 from extrap_train.reconstruction.depth_completion.examples import DepthExamples
 from extrap_train.reconstruction.depth_completion.network import WIDTHS, DepthMixture, DepthNetwork
@@ -22,10 +23,8 @@ from extrap_train.store.atomic import atomic_file, save_array
 LEARNING_RATE = 1e-3
 WEIGHT_DECAY = 0.01
 LARGEST_GRADIENT = 1.0
-_DAMAGE = (
-    pickle.UnpicklingError, RuntimeError, OSError, EOFError, ValueError, LookupError, TypeError,
-)  # fmt: skip
-"""What torch raises on files that are cut off or none of its own."""
+_ENTRIES: dict[str, type] = {"step": int, "network": dict, "average": dict, "optimizer": dict}
+"""What training cannot be resumed without."""
 _TRUTH, _WEIGHT = CHANNELS, CHANNELS + 1
 
 
@@ -84,7 +83,7 @@ class DepthTraining:
     def advance(self, examples: StoredExamples) -> float:
         """Take one step; returns its loss."""
         for group in self.optimizer.param_groups:
-            group["lr"] = LEARNING_RATE * self._rate()
+            group["lr"] = LEARNING_RATE * rate_at(self.step, self.options)
         rng = np.random.default_rng((self.seed, self.step))
         loss = loss_of(self.network, examples.batch(self.options.batch_size, rng))
         self.optimizer.zero_grad()
@@ -95,14 +94,6 @@ class DepthTraining:
         self.step += 1
         return float(loss.detach())
 
-    def _rate(self) -> float:
-        """Share of the full learning rate: a linear rise, then 1/sqrt(step) from
-        `full_rate_steps` on.
-        """
-        rise = (self.step + 1) / max(1, self.options.warmup_steps)
-        fall = (self.options.full_rate_steps / max(1, self.step)) ** 0.5
-        return min(1.0, rise, fall)
-
     def averaged_network(self) -> DepthNetwork:
         """A copy of the running average."""
         network = DepthNetwork(self.widths)
@@ -110,36 +101,29 @@ class DepthTraining:
         return network.eval()
 
     def save(self, path: Path) -> None:
-        """Write everything that `load` needs."""
-        with atomic_file(path) as temporary:
-            torch.save(
-                {
-                    "step": self.step,
-                    "network": self.network.state_dict(),
-                    "average": self.average.state_dict(),
-                    "optimizer": self.optimizer.state_dict(),
-                },
-                temporary,
-            )
+        """Write everything that `load` needs; InputError where the disk has no room for it."""
+        state = {
+            "step": self.step,
+            "network": self.network.state_dict(),
+            "average": self.average.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+        }
+        WholeCheckpointIO().save_checkpoint(state, path)
 
     def load(self, path: Path) -> None:
-        """Go on from a checkpoint; InputError if it is damaged."""
-        try:
+        """Go on from a checkpoint; InputError if it is damaged or of another network."""
+        damage = find_damage(path, _ENTRIES)
+        if damage is None:
             state = torch.load(path, weights_only=True)
-            self.step = int(state["step"])
-            self.network.load_state_dict(state["network"])
-            self.average.load_state_dict(state["average"])
-            self.optimizer.load_state_dict(state["optimizer"])
-        except (
-            pickle.UnpicklingError,
-            RuntimeError,
-            OSError,
-            EOFError,
-            ValueError,
-            LookupError,
-            TypeError,
-        ) as error:
-            reason = f"{type(error).__name__} {error}".splitlines()[0]
+            try:
+                self.network.load_state_dict(state["network"])
+                self.average.load_state_dict(state["average"])
+                self.optimizer.load_state_dict(state["optimizer"])
+            except (RuntimeError, ValueError, LookupError, TypeError) as error:
+                damage = f"{type(error).__name__} {error}".splitlines()[0]
+            else:
+                self.step = state["step"]
+        if damage is not None:
             raise InputError(
-                f"{path}: cannot be resumed from ({reason}); delete it to train from the start"
-            ) from None
+                f"{path}: cannot be resumed from ({damage}); delete it to train from the start"
+            )
