@@ -1,8 +1,9 @@
 """The diffusion model that is timed: full size on a GPU, a slim one of the same make on a CPU."""
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import product
 
 import torch
 from diffusers.models.attention_processor import AttnProcessor
@@ -11,7 +12,6 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils.flop_counter import FlopCounterMode
 
-from benchmarks.perf.live_bytes import LiveBytes
 from benchmarks.perf.timing import Row, compare
 from benchmarks.perf.warp_timing import ANGLES_DEG, QUERY_ANGLE_DEG, orbit_camera
 from extrap_train.config import ClipConfig, ModelConfig, UNetConfig, VaeConfig
@@ -25,66 +25,62 @@ PEAK_TFLOPS = {"H200": 989, "H100": 989, "A100": 312, "A6000": 155, "4090": 165}
 """Dense bfloat16 matrix products that the makers state, by a part of the device's name."""
 
 
+Run = Callable[[], Float[Tensor, "..."]]
+_DEVICES = {"cpu": ("0.3 of the width", 96, (1, 4)), "cuda": ("full size", 320, (1, 4, 16, 32))}
+"""Name of the model, channels of its finest level, and batch sizes; the paper trains with 4."""
+
+
 @dataclass(frozen=True)
-class Size:
-    """A model of the full size's make, and what it is called in the table."""
+class Workload:
+    """What is timed on one kind of device."""
 
-    name: str
-    width: int
-    """Channels of the finest level; 320 is the full size."""
-
-
-def devices() -> list[tuple[torch.device, Size, tuple[int, ...]]]:
-    """Where to measure, what, and at which batch sizes; the paper trains with 4."""
-    measured: list[tuple[torch.device, Size, tuple[int, ...]]]
-    measured = [(torch.device("cpu"), Size("0.3 of the width", 96), (1, 4))]
-    if torch.cuda.is_available():
-        measured.append((torch.device("cuda"), Size("full size", 320), (1, 4, 16, 32)))
-    return measured
+    title: str
+    passes: int
+    """Forward passes per image that it costs as much as."""
+    repeats: int
 
 
-def run_all(compare_case: Callable[[torch.device, Size, int, bool], Row]) -> list[Row]:
-    """A row per device and batch size, on a GPU also with torch.compile."""
-    return [
-        compare_case(device, size, count, compiled)
-        for device, size, counts in devices()
-        for count in counts
-        for compiled in ((False, True) if device.type == "cuda" else (False,))
-    ]
+def compare_models(
+    workloads: Mapping[str, Workload],
+    ours: Callable[[ExtrapolationModel, PairBatch], Run],
+    reference: Callable[[ExtrapolationModel, PairBatch], Run],
+) -> list[Row]:
+    """One row per device and batch size, on a GPU with torch.compile as well.
+
+    Prints the speed and memory of both. `workloads` are by device type; `reference` is built with
+    the plain copy of the model.
+    """
+    rows = []
+    for kind in ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",):
+        (name, width, counts), workload = _DEVICES[kind], workloads[kind]
+        device, config = torch.device(kind), configuration(width)
+        for count, compiled in product(counts, (False, True) if kind == "cuda" else (False,)):
+            model, batch = optimised(config, device), batch_of(count, device)
+            theirs = reference(plain(model), batch)
+            if compiled:
+                model.unet.compile()
+            mine = ours(model, batch)
+            case = f"{workload.title}, {name}, batch {count}{', compiled' if compiled else ''}"
+            row = compare(case, device, mine, theirs, workload.repeats)
+            flops = workload.passes * count * forward_flops(config)
+            print(f"{case}: {_describe(device, count, row.ours_ms, mine, flops)}")
+            print(f"  plain float32: {_describe(device, count, row.reference_ms, theirs, flops)}")
+            rows.append(row)
+    return rows
 
 
-def compare_and_report(
-    case: str,
-    device: torch.device,
-    count: int,
-    ours: Callable[[], Float[Tensor, "..."]],
-    reference: Callable[[], Float[Tensor, "..."]],
-    repeats: int,
-    flops: int,
-) -> Row:
-    """The row of two implementations; prints the speed and memory of both."""
-    row = compare(case, device, ours, reference, repeats)
-    for name, run_once, taken in (
-        (case, ours, row.ours_ms),
-        ("  plain float32", reference, row.reference_ms),
-    ):
-        print(report(name, device, count, taken, peak_mib(device, run_once), flops))
-    return row
-
-
-def configuration(size: Size) -> ModelConfig:
-    """The family `ours` as `model=ours` configures it, at another width."""
-    wide, narrow = 4 * size.width, size.width
+def configuration(width: int) -> ModelConfig:
+    """The family `ours` as `model=ours` has it, with `width` channels at its finest level."""
     return ModelConfig(
         name="perf",
         image_size=IMAGE_SIZE,
-        vae=VaeConfig(channels=[32 * max(1, round(narrow / 80)) * x for x in (1, 2, 4, 4)]),
-        clip=ClipConfig(width=64 * (narrow // 20), heads=narrow // 20),
+        vae=VaeConfig(channels=[32 * max(1, round(width / 80)) * x for x in (1, 2, 4, 4)]),
+        clip=ClipConfig(width=64 * (width // 20), heads=width // 20),
         residual=False,
         prediction="epsilon",
         zero_terminal_snr=False,
         unet=UNetConfig(
-            channels=[narrow, 2 * narrow, wide, wide],
+            channels=[width, 2 * width, 4 * width, 4 * width],
             layers_per_block=2,
             attention_levels=[True, True, True, False],
             heads=8,
@@ -145,28 +141,17 @@ def forward_flops(config: ModelConfig) -> int:
     return counter.get_total_flops()
 
 
-def peak_mib(device: torch.device, step: Callable[[], Float[Tensor, "..."]]) -> float:
-    """Most memory that tensors take during a step, beyond those that were there before it."""
+def _describe(device: torch.device, images: int, milliseconds: float, run: Run, flops: int) -> str:
+    """Images per second and achieved FLOP/s; on a GPU also peak memory and share of its peak."""
+    achieved = flops / milliseconds / 1e9
+    parts = [f"{1e3 * images / milliseconds:.3g} images/s", f"{achieved:.3g} TFLOP/s"]
     if device.type == "cuda":
         before = torch.cuda.memory_allocated()
         torch.cuda.reset_peak_memory_stats()
-        step()
-        return (torch.cuda.max_memory_allocated() - before) / 2**20
-    with LiveBytes(iter([])) as live:
-        step()
-    return live.peak / 2**20
-
-
-def report(
-    case: str, device: torch.device, images: int, milliseconds: float, peak: float, flops: float
-) -> str:
-    """One line: images a second, memory, and how much of the device that is."""
-    seconds = milliseconds / 1e3
-    achieved = flops / seconds / 1e12
-    name = torch.cuda.get_device_name() if device.type == "cuda" else "CPU"
-    limit = next((peak for part, peak in PEAK_TFLOPS.items() if part in name), None)
-    share = f", {100 * achieved / limit:.0f} % of the {name}'s peak" if limit else ""
-    return (
-        f"{case}: {images / seconds:.3g} images/s, {peak:.0f} MiB beside the weights, "
-        f"{achieved:.3g} TFLOP/s{share}"
-    )
+        run()
+        peak = torch.cuda.max_memory_allocated() - before
+        parts.append(f"{peak / 2**20:.0f} MiB beside the weights")
+        name = torch.cuda.get_device_name()
+        limits = [limit for part, limit in PEAK_TFLOPS.items() if part in name]
+        parts += [f"{100 * achieved / limit:.0f} % of the {name}'s peak" for limit in limits]
+    return ", ".join(parts)

@@ -5,10 +5,10 @@ from collections.abc import Callable
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn import functional
 
 from benchmarks.perf.timing import Row, compare
 from benchmarks.perf.warp_timing import orbit_camera
+from extrap_train.gaussians.density import rotation_matrices
 from extrap_train.gaussians.losses import photograph, photometric_loss
 from extrap_train.gaussians.projection import LOW_PASS, NEAR_PLANE
 from extrap_train.gaussians.projection_numba import MIN_ALPHA
@@ -149,17 +149,9 @@ def _project(
     along_x = torch.stack([k[0, 0] / z, zero, -k[0, 0] * x / z**2], -1)
     along_y = torch.stack([zero, k[1, 1] / z, -k[1, 1] * y / z**2], -1)
     jacobian = torch.stack([along_x, along_y], 1) @ camera.world_to_cam[:3, :3]
-    axes = jacobian @ (_rotations(quats) * scales[:, None])
+    axes = jacobian @ (rotation_matrices(quats) * scales[:, None])
     covariances = axes @ axes.mT + LOW_PASS * torch.eye(2)
     return torch.stack([k[0, 0] * x / z + k[0, 2], k[1, 1] * y / z + k[1, 2]], -1), covariances
-
-
-def _rotations(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
-    w, x, y, z = functional.normalize(quats, dim=-1).unbind(-1)
-    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
-    rows += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
-    rows += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
-    return torch.stack(rows, -1).reshape(-1, 3, 3)
 
 
 def _blend(

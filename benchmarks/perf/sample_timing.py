@@ -2,22 +2,11 @@
 against plain float32, one after the other.
 """
 
-from collections.abc import Callable
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks.perf.diffusion_case import (
-    Size,
-    batch_of,
-    compare_and_report,
-    configuration,
-    forward_flops,
-    optimised,
-    plain,
-    run_all,
-)
+from benchmarks.perf.diffusion_case import Run, Workload, compare_models
 from benchmarks.perf.timing import Row
 from extrap_train.config import SamplerConfig
 from extrap_train.diffusion.model import ExtrapolationModel
@@ -26,37 +15,25 @@ from extrap_train.views import PairBatch
 
 _GUIDANCE = 3.0
 _STEPS = {"cpu": 2, "cuda": 50}
-_REPEATS = {"cpu": 3, "cuda": 5}
-Sampling = Callable[[], Float[Tensor, "b 3 h w"]]
+_WORKLOADS = {
+    kind: Workload(f"{_STEPS[kind]} guided steps", 2 * _STEPS[kind], repeats)
+    for kind, repeats in (("cpu", 3), ("cuda", 5))
+}
 
 
 def run() -> list[Row]:
-    """A row a device and batch size; prints speed and memory.
+    """One row per device and batch size.
 
     On a GPU also with torch.compile, which the validations of a training with trainer.compile=true
     sample with, and no other task.
     """
-    return run_all(_compare)
+    return compare_models(_WORKLOADS, sampling, plain_sampling)
 
 
-def _compare(device: torch.device, size: Size, count: int, compiled: bool) -> Row:
-    config = configuration(size)
-    model, batch = optimised(config, device).eval(), batch_of(count, device)
-    steps = _STEPS[device.type]
-    reference = plain_sampling(plain(model), batch, steps)
-    if compiled:
-        model.unet.compile()
-    ours = sampling(model, batch, steps)
-    case = f"{steps} guided steps, {size.name}, batch {count}{', compiled' if compiled else ''}"
-    flops = 2 * steps * count * forward_flops(config)
-    repeats = _REPEATS[device.type]
-    return compare_and_report(case, device, count, ours, reference, repeats, flops)
-
-
-def sampling(model: ExtrapolationModel, batch: PairBatch, steps: int) -> Sampling:
+def sampling(model: ExtrapolationModel, batch: PairBatch) -> Run:
     """The product's sampler in mixed precision, the default of every task that paints."""
-    options = SamplerConfig(steps=steps, guidance=_GUIDANCE)
-    device = batch.image.device
+    device, model = batch.image.device, model.eval()
+    options = SamplerConfig(steps=_STEPS[device.type], guidance=_GUIDANCE)
 
     def sample() -> Float[Tensor, "b 3 h w"]:
         with torch.autocast(device.type, torch.bfloat16):
@@ -65,8 +42,9 @@ def sampling(model: ExtrapolationModel, batch: PairBatch, steps: int) -> Samplin
     return sample
 
 
-def plain_sampling(model: ExtrapolationModel, batch: PairBatch, steps: int) -> Sampling:
+def plain_sampling(model: ExtrapolationModel, batch: PairBatch) -> Run:
     """DDIM with guidance as one writes it down: two passes a step."""
+    model, steps = model.eval(), _STEPS[batch.image.device.type]
 
     @torch.no_grad()
     def sample() -> Float[Tensor, "b 3 h w"]:

@@ -1,17 +1,18 @@
 """Timing two implementations against each other, and the rows that come of it."""
 
-import csv
-import os
 import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
+import pandas as pd
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from extrap_train.store.atomic import write_atomic
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ def compare(
 ) -> Row:
     """Run both in turn, so that whatever else the machine does hits both; one round to warm up.
 
-    Says on standard error what came out: the next row may take minutes.
+    Prints the outcome on standard error: the next row may take minutes.
     """
     difference = float((ours() - reference()).abs().max())
     pairs = [
@@ -54,40 +55,23 @@ def compare(
 
 
 def write_rows(rows: Sequence[Row], path: Path) -> None:
-    """Write the CSV, whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    with partial.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [field.name for field in fields(Row)])
-        writer.writeheader()
-        writer.writerows(_formatted(row) for row in rows)
-    partial.replace(path)
+    """Write the rows as CSV."""
+    write_atomic(path, pd.DataFrame(rows).to_csv(index=False, float_format="%.4g").encode())
 
 
 def print_rows(rows: Sequence[Row]) -> None:
     """Print the same columns, aligned."""
-    lines = [
-        [field.name for field in fields(Row)],
-        *(list(_formatted(row).values()) for row in rows),
-    ]
-    widths = [max(len(cell) for cell in column) for column in zip(*lines, strict=True)]
-    for line in lines:
-        print("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)))
-
-
-def _formatted(row: Row) -> dict[str, str]:
-    return {name: x if isinstance(x, str) else f"{x:.4g}" for name, x in asdict(row).items()}
+    print(pd.DataFrame(rows).to_string(index=False, float_format=lambda value: f"{value:.4g}"))
 
 
 def _milliseconds(function: Callable[[], Float[Tensor, "..."]], device: torch.device) -> float:
-    _wait(device)
+    _synchronize(device)
     start = time.perf_counter()
     function()
-    _wait(device)
+    _synchronize(device)
     return (time.perf_counter() - start) * 1e3
 
 
-def _wait(device: torch.device) -> None:
-    """GPUs work on behind the caller's back."""
+def _synchronize(device: torch.device) -> None:
     if device.type == "cuda":
         torch.cuda.synchronize(device)

@@ -2,52 +2,36 @@
 last, against the same network in plain float32.
 """
 
-from collections.abc import Callable
+from functools import partial
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks.perf.diffusion_case import (
-    Size,
-    batch_of,
-    compare_and_report,
-    configuration,
-    forward_flops,
-    optimised,
-    plain,
-    run_all,
-)
+from benchmarks.perf.diffusion_case import Run, Workload, compare_models
 from benchmarks.perf.timing import Row
 from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.views import PairBatch
 
-Step = Callable[[], Float[Tensor, ""]]
-_REPEATS = {"cpu": 3, "cuda": 15}
 _FORWARD_AND_BACKWARD = 3
 """Operations of a training step over those of a forward pass, by convention."""
+_WORKLOADS = {
+    kind: Workload("step", _FORWARD_AND_BACKWARD, repeats)
+    for kind, repeats in (("cpu", 3), ("cuda", 15))
+}
 
 
 def run() -> list[Row]:
-    """A row a device and batch size, on a GPU also with torch.compile; prints speed and memory."""
-    return run_all(_compare)
+    """One row per device and batch size, on a GPU also with torch.compile."""
+    return compare_models(
+        _WORKLOADS,
+        partial(training_step, optimised=True),
+        partial(training_step, optimised=False),
+    )
 
 
-def _compare(device: torch.device, size: Size, count: int, compiled: bool) -> Row:
-    config = configuration(size)
-    model, batch = optimised(config, device), batch_of(count, device)
-    reference = training_step(plain(model), batch, optimised=False)
-    if compiled:
-        model.unet.compile()
-    ours = training_step(model, batch, optimised=True)
-    case = f"step, {size.name}, batch {count}{', compiled' if compiled else ''}"
-    flops = _FORWARD_AND_BACKWARD * count * forward_flops(config)
-    repeats = _REPEATS[device.type]
-    return compare_and_report(case, device, count, ours, reference, repeats, flops)
-
-
-def training_step(model: ExtrapolationModel, batch: PairBatch, *, optimised: bool) -> Step:
+def training_step(model: ExtrapolationModel, batch: PairBatch, *, optimised: bool) -> Run:
     """One step on the batch, with an optimiser of its own; it returns the loss."""
     device = batch.image.device
     optimizer = torch.optim.AdamW(

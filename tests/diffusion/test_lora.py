@@ -9,10 +9,10 @@ import peft
 import pytest
 import torch
 from lightning.fabric import Fabric
+from live_bytes import LiveBytes
 from orbits import walls
 from torch import Tensor, nn
 
-from benchmarks.perf.live_bytes import LiveBytes
 from extrap_train.config import LoraConfig, ModelConfig, SamplerConfig
 from extrap_train.data.scene_pairs import adaptation_pairs
 from extrap_train.diffusion.adaptation import Adaptation, adapt

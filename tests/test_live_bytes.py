@@ -1,8 +1,7 @@
 """The count of live bytes sees storages, and when they end."""
 
 import torch
-
-from benchmarks.perf.live_bytes import LiveBytes
+from live_bytes import LiveBytes
 
 
 def test_live_bytes_see_storages_and_their_ends() -> None:
