@@ -2,19 +2,25 @@
 its result.
 """
 
+import importlib
 import io
 import json
+import multiprocessing
 import os
 import shutil
 import signal
-import subprocess
 import sys
 import time
 from contextlib import redirect_stdout
+from dataclasses import dataclass
+from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import Any
 
+import numba
 import pandas as pd
 import pytest
+import torch
 from tiny_job import TINY
 
 from extrap_train.__main__ import main
@@ -34,13 +40,50 @@ def _arguments(output: Path, *more: str) -> list[str]:
     return [*_OPTIONS, f"output={output}", *more]
 
 
-def _start(
-    output: Path, program: tuple[str, str] = ("-m", "extrap_train")
-) -> "subprocess.Popen[bytes]":
-    command = [sys.executable, *program, *_arguments(output)]
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+_SERVER = multiprocessing.get_context("forkserver")
+"""Forks jobs that are killed: it has imported the program once for all of them."""
+_SERVER.set_forkserver_preload(["extrap_train.tasks.category", "data_prep.category_pairs"])
+
+
+@dataclass(frozen=True)
+class _Kill:
+    """A job kills itself when it calls `module.owner.name` with `where` in an argument."""
+
+    module: str
+    owner: str
+    name: str
+    where: str = ""
+
+    def arm(self) -> None:
+        owner = getattr(importlib.import_module(self.module), self.owner)
+        really = getattr(owner, self.name)
+
+        def killed(*arguments: Any, **options: Any) -> Any:
+            if self.where in str(arguments):
+                if self.name == "save":
+                    Path(arguments[1]).write_bytes(b"half")
+                os.kill(os.getpid(), signal.SIGKILL)
+            return really(*arguments, **options)
+
+        setattr(owner, self.name, killed)
+
+
+def _run_job(output: Path, kill: _Kill | None) -> None:
     with (output / "log.txt").open("wb") as log:
-        return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
+        os.dup2(log.fileno(), 1)
+        os.dup2(log.fileno(), 2)
+    sys.argv = ["extrap_train", *_arguments(output)]
+    torch.set_num_threads(1)
+    numba.set_num_threads(1)
+    if kill is not None:
+        kill.arm()
+    main()
+
+
+def _start(output: Path, kill: _Kill | None = None) -> BaseProcess:
+    job = _SERVER.Process(target=_run_job, args=(output, kill))
+    job.start()
+    return job
 
 
 def _said(output: Path) -> str:
@@ -117,58 +160,64 @@ def test_a_finished_run_is_measured_again_sampled_otherwise(
     assert (run / "summary.json").read_bytes() == before
 
 
-_KILLED_WITHIN = """
-import os, signal, sys
-from extrap_train.__main__ import main
-from {module} import {owner} as owner
-
-def killed(*arguments, **options):
-    if "{where}" in str(arguments):
-        if "{name}" == "save":
-            open(arguments[1], "wb").write(b"half")
-        os.kill(os.getpid(), signal.SIGKILL)
-    return really(*arguments, **options)
-
-really, owner.{name} = owner.{name}, killed
-main()
-"""
-"""A job that kills itself where a function is called, of a file half-written if it saves one."""
-
-
 def _kill_at_file(output: Path, pattern: str) -> None:
     """Start the job and kill it once such a file is there."""
-    process = _start(output)
-    while process.poll() is None and not any(output.glob(pattern)):
+    job = _start(output)
+    while job.is_alive() and not any(output.glob(pattern)):
         time.sleep(0.02)
-    assert process.poll() is None, _said(output)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+    assert job.is_alive(), _said(output)
+    job.kill()
+    job.join()
 
 
-def _kill_within(output: Path, module: str, owner: str, name: str, where: str) -> None:
-    """Start a job that kills itself within `module.owner.name(…)`, of whose arguments one says
-    `where`.
-    """
-    script = _KILLED_WITHIN.format(module=module, owner=owner, name=name, where=where)
-    process = _start(output, program=("-c", script))
-    process.wait(timeout=300)
-    assert process.returncode == -signal.SIGKILL, _said(output)
+def _kill_within(output: Path, kill: _Kill) -> None:
+    job = _start(output, kill)
+    job.join(timeout=300)
+    assert job.exitcode == -signal.SIGKILL, _said(output)
 
 
+_WITHIN_CHECKPOINT = _Kill("extrap_train.diffusion.resume", "torch", "save", "step-00000006")
+_WITHIN_VALIDATION = _Kill("extrap_train.diffusion", "evaluation", "sample_views")
+
+
+def _checkpoints(output: Path) -> list[str]:
+    return [path.name for path in (_run_folder(output) / "checkpoints").glob("step-*")]
+
+
+def test_killed_within_a_checkpoint_the_weights_are_the_same(
+    undisturbed: Path, tmp_path: Path
+) -> None:
+    """SIGKILL with half of the checkpoint written; then run to the end."""
+    _link_data(undisturbed, tmp_path)
+    _kill_within(tmp_path, _WITHIN_CHECKPOINT)
+    assert _checkpoints(tmp_path) == ["step-00000003.ckpt"], "killed within writing the second"
+    _finish(tmp_path)
+    _require_same(tmp_path, undisturbed)
+
+
+@pytest.mark.slow
 def test_killed_again_and_again_the_weights_are_the_same(undisturbed: Path, tmp_path: Path) -> None:
     """SIGKILL while sequences are rendered, within the writing of a checkpoint, within the
     validation behind it, and right after the last one; then run to the end.
     """
     _kill_at_file(tmp_path, "synthetic/hydrant/0000/**/*.jpg")
-    _kill_within(tmp_path, "extrap_train.diffusion.resume", "torch", "save", "step-00000006")
-    kept = [path.name for path in (_run_folder(tmp_path) / "checkpoints").glob("step-*")]
-    assert kept == ["step-00000003.ckpt"], "killed within the writing of the second"
-    _kill_within(tmp_path, "extrap_train.diffusion", "evaluation", "sample_views", "")
+    _kill_within(tmp_path, _WITHIN_CHECKPOINT)
+    _kill_within(tmp_path, _WITHIN_VALIDATION)
     assert not (_run_folder(tmp_path) / "metrics.csv").read_text().count("validation/")
     _kill_at_file(tmp_path, "train/hydrant/small/*/checkpoints/step-00000012.ckpt")
     _finish(tmp_path)
-    assert _weights(tmp_path) == _weights(undisturbed)
-    pd.testing.assert_frame_equal(_metrics(undisturbed), _metrics(tmp_path))
+    _require_same(tmp_path, undisturbed)
+
+
+def _link_data(source: Path, output: Path) -> None:
+    """Let a job use the rendered and prepared data of another."""
+    for name in ("synthetic", "data"):
+        (output / name).symlink_to(source / name)
+
+
+def _require_same(output: Path, undisturbed: Path) -> None:
+    assert _weights(output) == _weights(undisturbed)
+    pd.testing.assert_frame_equal(_metrics(undisturbed), _metrics(output))
 
 
 def _metrics(output: Path) -> pd.DataFrame:
@@ -186,24 +235,13 @@ def test_a_run_killed_behind_its_last_step_still_ends(undisturbed: Path, tmp_pat
     assert (run / "summary.json").is_file()
 
 
-def test_a_longer_training_goes_on_where_the_shorter_ended(
+def test_a_training_goes_on_with_changed_options_that_change_nothing_learnt(
     undisturbed: Path, tmp_path: Path
 ) -> None:
-    for name in ("synthetic", "data"):
-        (tmp_path / name).symlink_to(undisturbed / name)
-    _finish(tmp_path, "trainer.steps=6")
-    _finish(tmp_path)
-    assert _weights(tmp_path) == _weights(undisturbed)
-
-
-def test_what_is_no_part_of_a_run_changes_nothing_that_is_learnt(
-    undisturbed: Path, tmp_path: Path
-) -> None:
-    """How often is saved and measured, and by which process batches are loaded, here changed on
-    the way.
+    """A longer training continues where the shorter ended. How often it saves and measures, and
+    which process loads batches, change on the way.
     """
-    for name in ("synthetic", "data"):
-        (tmp_path / name).symlink_to(undisturbed / name)
+    _link_data(undisturbed, tmp_path)
     _finish(tmp_path, "trainer.steps=4", "trainer.checkpoint_every=2", "trainer.validate_every=4")
     first = _run_folder(tmp_path)
     changed = ["trainer.checkpoint_every=5", "trainer.validate_every=5", "trainer.workers=1"]

@@ -16,4 +16,5 @@ TINY = [
     "model.unet.heads=2",
     "model.unet.token_width=16",
     "trainer.batch_size=2",
+    "threads=1",
 ]
