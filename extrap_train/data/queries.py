@@ -6,9 +6,15 @@ import torch
 
 from extrap_train.data.examples import Example, collate
 from extrap_train.data.validation import is_degenerate
+from extrap_train.depth import require_depth
 from extrap_train.errors import InputError
 from extrap_train.geometry.viewpoints import references_by_nearness
 from extrap_train.views import Camera, PairBatch, View, stack_cameras
+
+_DEGENERATE = (
+    "its camera is degenerate (NaN, no rotation, or a focal length that is not positive); correct "
+    "the pose"
+)
 
 
 def query_batch(
@@ -20,12 +26,21 @@ def query_batch(
     truth, is NaN; beside it, the indices of every query's references, nearest first. Raises
     InputError where a pose is degenerate or a view has no depth.
     """
-    _require_usable(references, queries)
-    squares = [view if _fits(view.camera, size) else view.squared(size) for view in references]
+    if not references:
+        raise InputError("there is no view to start from; give at least one posed photograph")
+    for view in references:
+        if is_degenerate(view.camera):
+            raise InputError(f"view {view.name}: {_DEGENERATE}")
+    for index in is_degenerate(queries).nonzero().flatten().tolist():
+        raise InputError(f"query {index}: {_DEGENERATE}")
+    squares = [
+        view if (view.camera.height, view.camera.width) == (size, size) else view.squared(size)
+        for view in references
+    ]
     cameras = stack_cameras([view.camera for view in squares])
     order = references_by_nearness(cameras, queries)[:, :most_references]
     images = torch.stack([view.image for view in squares])
-    depths = torch.stack([_depth(view) for view in squares])
+    depths = torch.stack([require_depth(view) for view in squares])
     square_queries = queries.squared(size)
     unknown = torch.full((3, size, size), torch.nan)
     examples = [
@@ -33,37 +48,3 @@ def query_batch(
         for i, chosen in enumerate(torch.from_numpy(order))
     ]
     return collate(examples, most_references), [tuple(row) for row in order.tolist()]
-
-
-def _require_usable(references: Sequence[View], queries: Camera) -> None:
-    if not references:
-        raise InputError("there is no view to start from; give at least one posed photograph")
-    for view in references:
-        if is_degenerate(view.camera):
-            raise InputError(f"view {view.name}: {_DEGENERATE}")
-    _require_sound(queries)
-
-
-def _require_sound(queries: Camera) -> None:
-    bad = is_degenerate(queries).nonzero().flatten().tolist()
-    if bad:
-        raise InputError(f"query {bad[0]}: {_DEGENERATE}")
-
-
-_DEGENERATE = (
-    "its camera is degenerate (NaN, no rotation, or a focal length that is not positive); correct "
-    "the pose"
-)
-
-
-def _fits(camera: Camera, size: int) -> bool:
-    return (camera.height, camera.width) == (size, size)
-
-
-def _depth(view: View) -> torch.Tensor:
-    if view.depth is None:
-        raise InputError(
-            f"view {view.name or 'without a name'}: has no depth; use depth=stereo, which "
-            "estimates it from the photographs"
-        )
-    return view.depth

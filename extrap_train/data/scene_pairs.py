@@ -1,36 +1,88 @@
 """Pairs of a scene's input views, and of references beside them: what a model is adapted with."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Protocol, runtime_checkable
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from extrap_train.data.examples import Example, collate
-from extrap_train.data.virtual_references import VirtualReference, virtual_references
+from extrap_train.data.module import compute_warp
+from extrap_train.data.queries import query_batch
+from extrap_train.depth import require_depth
 from extrap_train.errors import InputError
-from extrap_train.geometry.viewpoints import extra_references, pairwise_angles, scene_center
+from extrap_train.geometry.fill import fill_holes
+from extrap_train.geometry.orbits import turn_camera
+from extrap_train.geometry.viewpoints import (
+    camera_centers,
+    common_center,
+    extra_references,
+    pairwise_angles,
+    scene_center,
+)
 from extrap_train.views import PairBatch, View, stack_cameras
 
-Pair = tuple[int, int]
-"""(query, its nearest reference), by their places among the views."""
+_NEAREST_RAD, _FARTHEST_RAD = np.deg2rad([10, 60])
+"""Angles that a reference stands beside its query at: about those that are asked for later."""
 
 
-@runtime_checkable
-class AdaptationPairs(Protocol):
+class AdaptationPairs(ABC):
     """Training examples of one scene, and some that are kept out of them."""
+
+    all: Sequence[Any]
+    training: Sequence[Any]
+    held_out: Sequence[Any]
+
+    def __init__(self, views: Sequence[View], most_references: int) -> None:
+        if len(views) < 2:
+            raise InputError(
+                f"the scene has {len(views)} input view, and pairs need at least two; give more "
+                "photographs, or use the model as it is (task=view)"
+            )
+        self.most_references = most_references
+        self.images = torch.stack([view.image for view in views])
+        self.depths = torch.stack([require_depth(view) for view in views])
+        self.cameras = stack_cameras([view.camera for view in views])
+        self.angles_rad = pairwise_angles(self.cameras, scene_center(self.cameras))
+
+    @abstractmethod
+    def example(self, pair: Any, rng: np.random.Generator, most: int) -> Example:
+        """A pair with further references, with the pair's own at most `most` of them."""
 
     def counts(self) -> dict[str, int]:
         """How many pairs there are, and how many are trained on."""
-        ...
+        return {"all": len(self.all), "trained": len(self.training)}
 
     def training_batch(self, size: int, rng: np.random.Generator) -> PairBatch:
-        """Pairs drawn without repetition as far as they go."""
-        ...
+        """`size` training pairs, each as often as any other but for the last round."""
+        count = len(self.training)
+        drawn = np.concatenate([rng.permutation(count) for _ in range(-(-size // count))])[:size]
+        most = rng.integers(1, self.most_references + 1, size)
+        examples = [
+            self.example(self.training[index], rng, int(limit))
+            for index, limit in zip(drawn, most, strict=True)
+        ]
+        return collate(examples, self.most_references)
 
     def held_out_batch(self) -> PairBatch:
         """What is held out, the same at every call."""
-        ...
+        rng, most = np.random.default_rng(0), self.most_references
+        return collate([self.example(pair, rng, most) for pair in self.held_out], most)
+
+    def pair_example(self, query: int, before: Sequence[View], places: Sequence[int]) -> Example:
+        """A view as the query of other views: those given, then those at the places."""
+        chosen = torch.tensor(places, dtype=torch.long)
+        cameras = [*(view.camera for view in before), *(self.cameras[place] for place in places)]
+        return Example(
+            self.images[query],
+            self.cameras[query],
+            torch.cat([*(view.image[None] for view in before), self.images[chosen]]),
+            stack_cameras(cameras),
+            torch.cat([*(require_depth(view)[None] for view in before), self.depths[chosen]]),
+        )
 
 
 def adaptation_pairs(
@@ -45,55 +97,41 @@ def adaptation_pairs(
     return ScenePairs(views, most_references)
 
 
-class ScenePairs:
-    """All N(N − 1) pairs of N posed views with depth (METHOD section 4).
+class ScenePairs(AdaptationPairs):
+    """All N(N − 1) pairs (query, nearest reference) of N posed views (METHOD section 4).
 
     The pair with the best score cos α·(1 − cos α), the likest to what is asked for later, is held
     out, and with it its query: a view that is trained towards says nothing about others.
     """
 
     def __init__(self, views: Sequence[View], most_references: int) -> None:
-        self._views = _Inputs(views)
-        self.most_references = most_references
+        super().__init__(views, most_references)
         places = range(len(views))
-        pairs = [(query, reference) for query in places for reference in places]
-        self.all = [(query, reference) for query, reference in pairs if query != reference]
-        self.held_out = max(self.all, key=self._score)
-        self.training = [pair for pair in self.all if pair[0] != self.held_out[0]]
+        self.all = [(q, r) for q in places for r in places if q != r]
+        cosine = np.cos(self.angles_rad)
+        score = cosine * (1 - cosine)
+        best = max(self.all, key=lambda pair: float(score[pair]))
+        self.held_out = [best]
+        self.training = [pair for pair in self.all if pair[0] != best[0]]
 
-    def _score(self, pair: Pair) -> float:
-        cosine = np.cos(self._views.angles_rad[pair])
-        return float(cosine * (1 - cosine))
-
-    def counts(self) -> dict[str, int]:
-        """See `AdaptationPairs.counts`."""
-        return {"all": len(self.all), "trained": len(self.training)}
-
-    def training_batch(self, size: int, rng: np.random.Generator) -> PairBatch:
-        """See `AdaptationPairs.training_batch`; each has one to `most_references` references."""
-        drawn = _draw_indices(len(self.training), size, rng)
-        counts = rng.integers(1, self.most_references + 1, size)
-        examples = [
-            self._example(self.training[place], int(count), rng)
-            for place, count in zip(drawn, counts, strict=True)
-        ]
-        return collate(examples, self.most_references)
-
-    def held_out_batch(self) -> PairBatch:
-        """The held-out pair, with all the references that it can have."""
-        rng = np.random.default_rng(0)
-        example = self._example(self.held_out, self.most_references, rng)
-        return collate([example], self.most_references)
-
-    def _example(self, pair: Pair, count: int, rng: np.random.Generator) -> Example:
-        query, first = pair
-        places = np.arange(len(self._views.images))
-        angles = self._views.angles_rad
-        further = extra_references(angles, query, first, count, rng, places)
-        return self._views.example(query, [], [first, *further])
+    def example(self, pair: tuple[int, int], rng: np.random.Generator, most: int) -> Example:
+        """The pair, and references further from the query, spread around the scene."""
+        places = np.arange(len(self.images))
+        further = extra_references(self.angles_rad, *pair, most, rng, places)
+        return self.pair_example(pair[0], [], [pair[1], *further])
 
 
-class VirtualPairs:
+@dataclass(frozen=True)
+class VirtualReference:
+    """A view that stands beside one of the inputs, the query that it is a reference of."""
+
+    view: View
+    """Warped from its query. Depth is 0 where that does not reach; the image is filled there."""
+    query: int
+    angle_rad: float
+
+
+class VirtualPairs(AdaptationPairs):
     """Every view as the query of references that were warped beside it.
 
     Few inputs stand far apart: their own pairs ask for what none of the references shows, which
@@ -107,72 +145,61 @@ class VirtualPairs:
     def __init__(
         self, views: Sequence[View], most_references: int, virtual: int, seed: int
     ) -> None:
-        self._views = _Inputs(views)
-        self.most_references = most_references
+        super().__init__(views, most_references)
         self.all = virtual_references(views, virtual, seed)
         middle = virtual // 2
         self.held_out = self.all[middle::virtual]
         self.training = [pair for i, pair in enumerate(self.all) if i % virtual != middle]
 
-    def counts(self) -> dict[str, int]:
-        """See `AdaptationPairs.counts`."""
-        return {"all": len(self.all), "trained": len(self.training)}
-
-    def training_batch(self, size: int, rng: np.random.Generator) -> PairBatch:
-        """See `AdaptationPairs.training_batch`; inputs farther than it stand beside a reference."""
-        drawn = _draw_indices(len(self.training), size, rng)
-        examples = [self._example(self.training[place], rng) for place in drawn]
-        return collate(examples, self.most_references)
-
-    def held_out_batch(self) -> PairBatch:
-        """The held-out reference of every view."""
-        rng = np.random.default_rng(0)
-        examples = [self._example(pair, rng) for pair in self.held_out]
-        return collate(examples, self.most_references)
-
-    def _example(self, pair: VirtualReference, rng: np.random.Generator) -> Example:
-        angles = self._views.angles_rad[pair.query]
-        places = np.arange(len(angles))
-        behind = places[(places != pair.query) & (angles >= pair.angle_rad)]
-        count = int(rng.integers(0, min(self.most_references - 1, len(behind)) + 1))
-        further = sorted(rng.permutation(behind)[:count].tolist(), key=lambda view: angles[view])
-        return self._views.example(pair.query, [pair.view], further)
+    def example(self, pair: VirtualReference, rng: np.random.Generator, most: int) -> Example:
+        """The reference, and inputs that are farther from the query than it."""
+        angles = self.angles_rad[pair.query]
+        behind = np.flatnonzero(angles >= pair.angle_rad)
+        further = rng.permutation(behind[behind != pair.query])[: most - 1].tolist()
+        further.sort(key=lambda view: angles[view])
+        return self.pair_example(pair.query, [pair.view], further)
 
 
-def _draw_indices(count: int, size: int, rng: np.random.Generator) -> list[int]:
-    """`size` of `count` places, each as often as any other but for the last round."""
-    rounds = -(-size // count)
-    return np.concatenate([rng.permutation(count) for _ in range(rounds)])[:size].tolist()
+def virtual_references(views: Sequence[View], count: int, seed: int) -> list[VirtualReference]:
+    """`count` references beside each of the views (square, all of one size, with depth).
+
+    They are turned about the scene's vertical by angles that are drawn evenly between 10 and 60
+    degrees, to both sides in turn, and see what their own view sees. The other views are left out:
+    where exposures differ, or depth is estimated, they teach to blur. Deterministic in the seed.
+    """
+    cameras = stack_cameras([view.camera for view in views])
+    pivots = _pivots(views)
+    # Where the images' up points on average; two cameras do not say more of their orbit.
+    up = -cameras.world_to_cam[:, 1, :3].double().numpy(force=True).mean(0)
+    length = np.linalg.norm(up)
+    axis = up / length if length > 0 else np.array([0.0, -1.0, 0.0])
+    rng = np.random.default_rng(seed)
+    made: list[VirtualReference] = []
+    for query, view in enumerate(views):
+        shares = (np.arange(count) + rng.uniform(size=count)) / count
+        angles = _NEAREST_RAD + (_FARTHEST_RAD - _NEAREST_RAD) * shares
+        sides = np.where(np.arange(count) % 2, 1.0, -1.0)
+        turned = turn_camera(view.camera, pivots[query], axis, angles * sides)
+        batch, _ = query_batch([view], turned, 1, view.camera.height)
+        warp = compute_warp(batch).warp
+        assert warp is not None
+        images = fill_holes(warp.image, warp.mask).clamp(0, 1)
+        made += [
+            VirtualReference(View(images[i], turned[i], warp.depth[i]), query, float(angles[i]))
+            for i in range(count)
+        ]
+    return made
 
 
-class _Inputs:
-    """The views side by side, and the angles between them."""
-
-    def __init__(self, views: Sequence[View]) -> None:
-        if len(views) < 2:
-            raise InputError(
-                f"the scene has {len(views)} input view, and pairs need at least two; give more "
-                "photographs, or use the model as it is (task=view)"
-            )
-        self.images = torch.stack([view.image for view in views])
-        self.depths = torch.stack([_depth(view) for view in views])
-        self.cameras = stack_cameras([view.camera for view in views])
-        self.angles_rad = pairwise_angles(self.cameras, scene_center(self.cameras))
-
-    def example(self, query: int, before: Sequence[View], places: Sequence[int]) -> Example:
-        """A view as the query of other views: those given, then those at the places."""
-        chosen = torch.tensor(places, dtype=torch.long)
-        cameras = [*(view.camera for view in before), *(self.cameras[place] for place in places)]
-        return Example(
-            self.images[query],
-            self.cameras[query],
-            torch.cat([*(view.image[None] for view in before), self.images[chosen]]),
-            stack_cameras(cameras),
-            torch.cat([*(_depth(view)[None] for view in before), self.depths[chosen]]),
-        )
-
-
-def _depth(view: View) -> torch.Tensor:
-    if view.depth is None:
-        raise InputError(f"view {view.name}: has no depth; use depth=stereo, which estimates it")
-    return view.depth
+def _pivots(views: Sequence[View]) -> list[Float[np.ndarray, "3"]]:
+    """What each view is turned about: the scene's centre; where they have none in common, the
+    point in the middle of its image at its median depth.
+    """
+    cameras = stack_cameras([view.camera for view in views])
+    center = common_center(cameras)
+    if center is not None:
+        return [center] * len(views)
+    forward = cameras.forward.double().numpy(force=True)
+    known = [depth[depth > 0] for depth in map(require_depth, views)]
+    depths = np.array([float(depth.median()) if len(depth) else 1.0 for depth in known])
+    return list(camera_centers(cameras) + depths[:, None] * forward)

@@ -53,6 +53,16 @@ class DepthMap:
         return DepthMap(*resample_surfaces(both, (height, width)))
 
 
+def require_depth(view: View) -> Float[Tensor, "h w"]:
+    """The view's depth; InputError where it has none."""
+    if view.depth is None:
+        raise InputError(
+            f"{view.name or 'a view'}: has no depth; use depth=stereo, which estimates it from "
+            "the photographs"
+        )
+    return view.depth
+
+
 def point_maps_of(
     first: View, first_map: DepthMap, second: View, second_map: DepthMap
 ) -> PointMaps:

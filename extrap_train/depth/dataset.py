@@ -5,11 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from extrap_train.depth import DepthMap, PointMaps, point_maps_of
-from extrap_train.errors import InputError
+from extrap_train.depth import DepthMap, PointMaps, point_maps_of, require_depth
 from extrap_train.views import View
 
 LOG = logging.getLogger(__name__)
@@ -25,7 +22,7 @@ class DatasetDepth:
 
     def depth_map(self, view: View, neighbours: Sequence[View]) -> DepthMap:
         """The view's own depth; the neighbours are not looked at. InputError if it has none."""
-        depth = _depth(view)
+        depth = require_depth(view)
         return DepthMap(depth, (depth > 0).to(depth.dtype))
 
     def depth_maps(self, views: Sequence[View]) -> list[DepthMap]:
@@ -35,7 +32,7 @@ class DatasetDepth:
         """
         without = [view for view in views if view.depth is None]
         if without and len(without) == len(views):
-            _depth(without[0])
+            require_depth(without[0])
         if without:
             LOG.warning(
                 "depth=dataset: %d of %d views have no depth (%s is the first); use depth=stereo "
@@ -55,12 +52,3 @@ class DatasetDepth:
         """Both views' points in the first camera's frame."""
         one, two = self.depth_map(first, ()), self.depth_map(second, ())
         return point_maps_of(first, one, second, two)
-
-
-def _depth(view: View) -> Float[Tensor, "h w"]:
-    if view.depth is None:
-        raise InputError(
-            f"{view.name or 'a view'}: has no depth; use depth=stereo, which estimates it from "
-            "the photographs"
-        )
-    return view.depth
