@@ -11,7 +11,6 @@ from torch import Tensor
 
 from extrap_train.config import MonocularConfig
 from extrap_train.depth import DepthMap, PointMaps, point_maps_of
-from extrap_train.depth.line_fit import robust_line
 from extrap_train.depth.neighbours import WIDEST_RAD, neighbours_of
 from extrap_train.errors import InputError
 from extrap_train.geometry.resample import sample_pixels
@@ -155,3 +154,66 @@ class MonocularDepth:
         # The error of an inverse depth is the pixel's over the parallax.
         weights = matches.confidence * found.parallax_rad.square()
         return _Points(matches.first[good], found.depth[good], weights[good])
+
+
+TRIALS = 256
+REFINEMENTS = 10
+MAD_TO_SIGMA = 1.4826
+"""Standard deviation of normal errors whose median absolute value is 1."""
+CAUCHY = 2.385
+"""Tuning constant: 95 % efficiency where errors are normal (Holland and Welsch, 1977)."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """y = slope · x + offset."""
+
+    slope: float
+    offset: float
+
+    def __call__(self, x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+        """y at x."""
+        return self.slope * x + self.offset
+
+
+def robust_line(
+    x: Float[Tensor, " n"], y: Float[Tensor, " n"], weights: Float[Tensor, " n"]
+) -> Line | None:
+    """The line with the least median residual over random pairs (Rousseeuw, 1984), refined by
+    reweighted least squares with Cauchy's weights.
+
+    Holds against just under half of the points. None if fewer than two values of x differ. The
+    pairs are drawn the same way every time; double precision.
+    """
+    x, y, weights = (values.detach().double().cpu() for values in (x, y, weights))
+    if len(x) < 2:
+        return None
+    generator = torch.Generator().manual_seed(0)
+    ends = torch.multinomial(weights.clamp_min(0) + 1e-12, 2 * TRIALS, True, generator=generator)
+    first, second = ends.view(2, TRIALS)
+    apart = (x[first] - x[second]).abs() > 1e-9 * x.abs().amax()
+    if not apart.any():
+        return None
+    first, second = first[apart], second[apart]
+    slopes = (y[first] - y[second]) / (x[first] - x[second])
+    offsets = y[first] - slopes * x[first]
+    medians = (y - slopes[:, None] * x - offsets[:, None]).abs().median(-1).values
+    best = int(medians.argmin())
+    line = Line(float(slopes[best]), float(offsets[best]))
+    for _ in range(REFINEMENTS):
+        residuals = y - line(x)
+        spread = float(residuals.abs().median()) * MAD_TO_SIGMA
+        if spread <= 1e-12 * float(y.abs().amax()):
+            return line
+        trusted = weights / (1 + (residuals / (CAUCHY * spread)).square())
+        line = _least_squares(x, y, trusted)
+    return line
+
+
+def _least_squares(
+    x: Float[Tensor, " n"], y: Float[Tensor, " n"], weights: Float[Tensor, " n"]
+) -> Line:
+    share = weights / weights.sum()
+    mean_x, mean_y = (share * x).sum(), (share * y).sum()
+    slope = (share * (x - mean_x) * (y - mean_y)).sum() / (share * (x - mean_x).square()).sum()
+    return Line(float(slope), float(mean_y - slope * mean_x))

@@ -8,19 +8,22 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
 
 from extrap_train.config import StereoConfig
 from extrap_train.depth import DepthMap, NoDepthError, PointMaps, point_maps_of
-from extrap_train.depth.depth_range import convergence_point, inverse_depth_range
-from extrap_train.depth.left_right_check import agreement, forward_backward_error
 from extrap_train.depth.neighbours import (
     LEAST_RAD,
     LIMIT_RAD,
+    convergence_point,
+    inverse_depth_range,
     nearest_angle_rad,
     neighbours_of,
 )
+from extrap_train.depth.photo_cost import projection_between
 from extrap_train.depth.plane_sweep import Estimate, sweep
-from extrap_train.views import View
+from extrap_train.geometry.cameras import pixel_grid
+from extrap_train.views import Camera, View
 
 LOG = logging.getLogger(__name__)
 NAMED = 4
@@ -179,3 +182,38 @@ def _check(
         for other in helpers
     ]
     return DepthMap(1 / own.inverse_depth, own.correlation * agreement(torch.stack(errors)))
+
+
+LARGEST_ERROR = 2.0
+"""Forward-backward error, in pixels, from which two depths contradict each other."""
+
+
+def forward_backward_error(
+    inverse_depth: Float[Tensor, "h w"],
+    camera: Camera,
+    other_inverse_depth: Float[Tensor, "h2 w2"],
+    other_camera: Camera,
+) -> Float[Tensor, "h w"]:
+    """How many pixels from where it started a pixel returns: there by its own depth, back by the
+    other view's. Infinite where the other view does not see the point."""
+    there = projection_between(camera, other_camera)
+    coordinates, inside = there.normalised_points(inverse_depth)
+    found = functional.grid_sample(
+        other_inverse_depth[None, None],
+        coordinates[None],
+        padding_mode="border",
+        align_corners=False,
+    )[0, 0]
+    pixels, _ = there.points(inverse_depth)
+    returned = projection_between(other_camera, camera, pixels).points(found)[0]
+    grid = pixel_grid(camera.height, camera.width, inverse_depth.device)
+    return torch.where(inside, (returned - grid).norm(dim=-1), torch.inf)
+
+
+def agreement(errors: Float[Tensor, "k h w"]) -> Float[Tensor, "h w"]:
+    """Mean of exp(−error²/2) over the better half of the neighbours: 1 is perfect, 0 contradiction.
+
+    Only half of them have to agree: a point may be hidden from the others.
+    """
+    each = torch.where(errors < LARGEST_ERROR, (-errors.square() / 2).exp(), 0)
+    return each.sort(0, descending=True).values[: (len(each) + 1) // 2].mean(0)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from extrap_train.depth import DepthMap, DepthSource
-from extrap_train.depth.depth_range import convergence_point
+from extrap_train.depth.neighbours import convergence_point
 from extrap_train.errors import InputError
 from extrap_train.geometry.world_frame import WorldFrame
 from extrap_train.views import Camera, View

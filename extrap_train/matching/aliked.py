@@ -9,8 +9,7 @@ from kornia.feature import ALIKED, match_smnn
 from torch import Tensor
 
 from extrap_train.config import AlikedMatcherConfig
-from extrap_train.matching import Matches, is_known_at
-from extrap_train.matching.working_size import resize, to_image_pixels
+from extrap_train.matching import Matches, is_known_at, resize, to_image_pixels
 from extrap_train.weight_files import WeightFile
 
 LARGEST_RATIO = 0.9

@@ -16,8 +16,7 @@ from extrap_train.geometry.cameras import pixel_grid
 from extrap_train.geometry.fill import fill_holes
 from extrap_train.geometry.ncc import windowed_correlation
 from extrap_train.geometry.resample import sample_pixels
-from extrap_train.matching import DenseFlow, Matches
-from extrap_train.matching.working_size import resize, to_grey
+from extrap_train.matching import DenseFlow, Matches, resize, to_grey
 
 LARGEST_ENLARGEMENT = 2.0
 """Enlarged twice, small pictures are matched to about a tenth of a pixel; more brings nothing."""

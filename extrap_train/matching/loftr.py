@@ -12,8 +12,7 @@ from kornia.feature.loftr.loftr import default_cfg
 from torch import Tensor
 
 from extrap_train.config import LoftrMatcherConfig
-from extrap_train.matching import Matches, is_known_at
-from extrap_train.matching.working_size import resize, to_grey, to_image_pixels
+from extrap_train.matching import Matches, is_known_at, resize, to_grey, to_image_pixels
 from extrap_train.weight_files import WeightFile
 
 STRIDE = 8

@@ -4,7 +4,7 @@ import pytest
 import torch
 from traced_scenes import SCENES, orbit_camera, render
 
-from extrap_train.depth.depth_range import convergence_point, inverse_depth_range
+from extrap_train.depth.neighbours import convergence_point, inverse_depth_range
 from extrap_train.depth.plane_sweep import sweep
 from extrap_train.views import Camera, View
 

@@ -2,7 +2,7 @@ import numpy as np
 import torch
 
 from extrap_train.depth import DepthMap
-from extrap_train.depth.fusion import fuse_depth_maps, weighted_median
+from extrap_train.depth.mast3r.source import fuse_depth_maps, weighted_median
 
 
 def estimate(depth: float, confidence: float) -> DepthMap:

@@ -1,7 +1,7 @@
 import torch
 from traced_scenes import SCENES, orbit_camera, render
 
-from extrap_train.depth.left_right_check import agreement, forward_backward_error
+from extrap_train.depth.stereo import agreement, forward_backward_error
 
 ONE, OTHER = (render(SCENES["slanted plane"], orbit_camera(a, 96)) for a in (0, 12))
 

@@ -1,7 +1,7 @@
 import numpy as np
 import torch
 
-from extrap_train.depth.line_fit import robust_line
+from extrap_train.depth.monocular import robust_line
 
 
 def sample(outliers: float, noise: float, count: int = 300):

@@ -1,8 +1,7 @@
 import torch
 from traced_scenes import orbit_camera
 
-from extrap_train.depth.depth_range import convergence_point
-from extrap_train.depth.neighbours import choose_neighbours
+from extrap_train.depth.neighbours import choose_neighbours, convergence_point
 from extrap_train.views import Camera
 
 

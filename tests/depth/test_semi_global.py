@@ -3,7 +3,7 @@ import itertools
 import numpy as np
 import torch
 
-from extrap_train.depth.semi_global import EDGE_CONTRAST, JUMP, SMALL_STEP, semi_global_cost
+from extrap_train.depth.plane_sweep import EDGE_CONTRAST, JUMP, SMALL_STEP, semi_global_cost
 
 
 def pixel_by_pixel(cost: np.ndarray, image: np.ndarray) -> np.ndarray:

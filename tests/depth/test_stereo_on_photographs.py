@@ -9,8 +9,7 @@ from torch.nn import functional
 
 from extrap_train.config import StereoConfig
 from extrap_train.data.co3d import read_category
-from extrap_train.depth.left_right_check import forward_backward_error
-from extrap_train.depth.stereo import PlaneSweepStereo
+from extrap_train.depth.stereo import PlaneSweepStereo, forward_backward_error
 from extrap_train.views import Camera, View
 
 FOCAL, BASELINE, OFFSET = 994.978, 193.001, 31.086

@@ -1,7 +1,7 @@
 import torch
 
 from extrap_train.geometry.cameras import pixel_grid
-from extrap_train.matching.working_size import resize, to_grey, to_image_pixels
+from extrap_train.matching import resize, to_grey, to_image_pixels
 
 
 def test_pixels_of_a_smaller_copy_show_the_same():

@@ -1,19 +1,50 @@
 """Depth of posed views from a pairwise point-map network."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
 
 from extrap_train.config import Mast3rConfig
 from extrap_train.depth import DepthMap, PointMaps, point_maps_of
-from extrap_train.depth.fusion import fuse_depth_maps
 from extrap_train.depth.mast3r.known_cameras import posed_depths
 from extrap_train.depth.mast3r.network import Encoding, PointMapNetwork
-from extrap_train.depth.mast3r.network_input import Fit, fit, network_input
 from extrap_train.depth.neighbours import WIDEST_RAD, neighbours_of
 from extrap_train.errors import InputError
 from extrap_train.views import Camera, View, combine
+
+SAME_DEPTH = math.log(1.05)
+"""Estimates whose logarithms differ by more mean different surfaces."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How a view becomes the network's: resampled, then cropped around its middle."""
+
+    resized: tuple[int, int]
+    """(height, width) before the crop."""
+    top: int
+    left: int
+    height: int
+    width: int
+
+    def apply(self, view: View) -> View:
+        """The network's view; its camera sees what the crop shows."""
+        return view.resized(*self.resized).cropped(self.top, self.left, self.height, self.width)
+
+    def undo(self, depth_map: DepthMap, height: int, width: int) -> DepthMap:
+        """Depth of the crop as depth of the view that it came from; unknown (0) outside."""
+        below = self.resized[0] - self.top - self.height
+        right = self.resized[1] - self.left - self.width
+        margins = (self.left, right, self.top, below)
+        whole = DepthMap(
+            functional.pad(depth_map.depth, margins), functional.pad(depth_map.confidence, margins)
+        )
+        return whole.resized(height, width)
 
 
 @dataclass(frozen=True)
@@ -132,3 +163,54 @@ class Mast3rDepth:
         predictions = self.network.decode(first.encoding, second.encoding)
         found = posed_depths(*predictions, first.camera, second.camera)
         return found and (first.undone(found[0]), second.undone(found[1]))
+
+
+def fuse_depth_maps(estimates: Sequence[DepthMap]) -> DepthMap:
+    """The confidence-weighted median of each pixel, then the mean of the estimates that agree.
+
+    Confidence is the mean of those that agree times their share of the weight. Unknown where all
+    are. One estimate stays as it is.
+    """
+    depths = torch.stack([estimate.depth for estimate in estimates])
+    weights = torch.stack([estimate.confidence for estimate in estimates]) * (depths > 0)
+    logs = depths.clamp_min(1e-30).log()
+    agree = weights * ((logs - weighted_median(logs, weights)).abs() <= SAME_DEPTH)
+    total, known = weights.sum(0), agree.sum(0)
+    safe = known.clamp_min(1e-12)
+    mean = ((logs * agree).sum(0) / safe).exp()
+    confidence = agree.square().sum(0) / safe * known / total.clamp_min(1e-12)
+    return DepthMap(torch.where(known > 0, mean, 0), torch.where(known > 0, confidence, 0))
+
+
+def weighted_median(
+    values: Float[Tensor, "k ..."], weights: Float[Tensor, "k ..."]
+) -> Float[Tensor, "*n"]:
+    """The least value that, with all below it, has half the weight; anything where that is 0."""
+    order = values.argsort(0)
+    heights = weights.gather(0, order).cumsum(0)
+    middle = (heights < heights[-1:] / 2).sum(0, keepdim=True).clamp_max(len(values) - 1)
+    return values.gather(0, order).gather(0, middle)[0]
+
+
+def fit(view: View, image_size: int, patch: int, square: bool) -> Fit:
+    """The longer side becomes `image_size`, both are cut to multiples of `patch`.
+
+    Unless `square`, a square picture is cut to 4:3, the squarest shape that the published networks
+    of 512 pixels know. InputError where a picture is too narrow for a single patch.
+    """
+    scale = image_size / max(view.camera.height, view.camera.width)
+    resized = round(view.camera.height * scale), round(view.camera.width * scale)
+    height, width = (side // patch * patch for side in resized)
+    if height == width and not square:
+        height = max(height * 3 // 4 // patch, 1) * patch
+    if not height or not width:
+        raise InputError(
+            f"{view.name or 'a view'}: {view.camera.height} x {view.camera.width} pixels are too "
+            f"narrow for depth.image_size={image_size}, at which a side has under {patch}"
+        )
+    return Fit(resized, (resized[0] - height) // 2, (resized[1] - width) // 2, height, width)
+
+
+def network_input(view: View, device: torch.device) -> Float[Tensor, "1 3 h w"]:
+    """Colours as the network wants them, in [−1, 1]."""
+    return (view.image[None].to(device) - 0.5) / 0.5

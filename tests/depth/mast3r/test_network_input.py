@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from extrap_train.depth import DepthMap
-from extrap_train.depth.mast3r.network_input import fit, network_input
+from extrap_train.depth.mast3r.source import fit, network_input
 from extrap_train.errors import InputError
 from extrap_train.geometry.cameras import pixel_grid, project, unproject_to_world
 from extrap_train.views import Camera, View

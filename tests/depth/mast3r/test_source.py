@@ -9,9 +9,7 @@ from traced_scenes import SCENES, orbit_camera, render
 
 from extrap_train.config import Mast3rConfig
 from extrap_train.depth import DepthSource
-from extrap_train.depth.fusion import fuse_depth_maps
-from extrap_train.depth.mast3r.network_input import fit
-from extrap_train.depth.mast3r.source import Mast3rDepth
+from extrap_train.depth.mast3r.source import Mast3rDepth, fit, fuse_depth_maps
 from extrap_train.depth.sources import depth_source
 from extrap_train.errors import InputError
 from extrap_train.geometry.cameras import transform, unproject_to_world
