@@ -13,8 +13,8 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from data_prep.model_cache import PrepModels
-from data_prep.pairs import pair_options
 from data_prep.preparation import prepare
+from data_prep.sequence_job import pair_options
 from data_prep.synthesize import synthesize
 from extrap_train.config import (
     CategoryConfig,

@@ -5,32 +5,58 @@ alone, so running a job twice costs nothing.
 """
 
 import errno
+import hashlib
+import json
 import logging
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import pandas as pd
+import pyarrow as pa
 import torch
+from jaxtyping import Bool, Float
 
-from data_prep.correct import METHOD
+from data_prep.correct import METHOD, correct_pair
 from data_prep.model_cache import PrepModels
-from data_prep.pairs import PairFiles, choose_pairs, correct_pairs
+from data_prep.select import select_pairs
 from extrap_train.config import PrepConfig
 from extrap_train.data.frame_files import (
     CAMERAS,
+    FLOWS,
+    SealedTable,
     StoredFrames,
     frames_folder,
-    is_sealed,
-    read_camera_table,
+    pairs_folder,
     write_frames,
 )
 from extrap_train.data.sequences import FrameSequence
-from extrap_train.data.square_frames import make_frames
+from extrap_train.data.square_frames import held_out_mask, make_frames
 from extrap_train.device import is_out_of_memory
 from extrap_train.errors import InputError
+from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
+from extrap_train.matching import Matcher
+from extrap_train.terminal import track
 
 LOG = logging.getLogger(__name__)
+MIN_DEPTH_SHARE = 0.02
+"""A frame with less of its depth known cannot be a reference: its warp would be empty."""
+PAIRS = "pairs.parquet"
+_OPTIONS = (
+    "max_uses",
+    "min_pair_angle_deg",
+    "max_pair_angle_deg",
+    "near_duplicate_deg",
+    "correction_grid",
+)
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 """What ends the whole run: the next sequence would find no room either."""
+
+
+def pair_options(options: PrepConfig) -> dict[str, Any]:
+    """The options that decide about the pairs of a sequence and their corrections."""
+    return {name: getattr(options, name) for name in _OPTIONS}
 
 
 @dataclass(frozen=True)
@@ -80,22 +106,23 @@ class SequenceJob:
         return f"{self.capture_key}{' with frames held out' if self.is_lone else ''}"
 
     @property
-    def frames_folder(self) -> Path:
-        """Where they lie."""
-        return frames_folder(self.context.frames_root, self.name, self.is_lone)
+    def frames(self) -> SealedTable:
+        """The cameras' table, which seals images, depths and masks."""
+        folder = frames_folder(self.context.frames_root, self.name, self.is_lone)
+        return SealedTable(folder / CAMERAS, self.frames_key)
+
+    @property
+    def pairs(self) -> SealedTable:
+        """The pairs' table, which seals their flows."""
+        context, folder = self.context, pairs_folder(self.context.pairs_root, self.name, self.role)
+        made_from = [self.frames_key, self.role, pair_options(context.options), context.correction]
+        content = json.dumps(made_from, sort_keys=True)
+        return SealedTable(folder / PAIRS, hashlib.sha256(content.encode()).hexdigest())
 
     @property
     def is_there(self) -> bool:
         """Whether frames and pairs are whole and made from what is asked for."""
-        frames = is_sealed(self.frames_folder / CAMERAS, self.frames_key)
-        return frames and self.pair_files.are_there()
-
-    @property
-    def pair_files(self) -> PairFiles:
-        """Where the pairs lie, and what they are made from."""
-        context = self.context
-        made_from = (self.frames_key, self.role, context.options, context.correction)
-        return PairFiles.of(context.pairs_root, self.name, *made_from)
+        return self.frames.is_there() and self.pairs.is_there()
 
 
 def prepare_sequence(job: SequenceJob) -> str:
@@ -123,20 +150,89 @@ def prepare_sequence(job: SequenceJob) -> str:
 
 
 def _prepare(job: SequenceJob) -> None:
-    context, folder, key = job.context, job.frames_folder, job.frames_key
-    table = read_camera_table(folder, key)
+    options, models = job.context.options, job.context.models
+    table = job.frames.read()
     if table is None:
-        source = context.models.depth_source()
-        frames = make_frames(job.sequence, source, context.options.image_size, job.is_lone)
-        write_frames(folder, frames, key)
-        table = read_camera_table(folder, key)
+        frames = make_frames(job.sequence, models.depth_source(), options.image_size, job.is_lone)
+        write_frames(job.frames, frames)
+        table = job.frames.read()
         if table is None:
-            raise OSError(f"{folder}: the disk has not kept what was written")
-    files = job.pair_files
-    if files.are_there():
+            raise OSError(f"{job.frames.file.parent}: the disk has not kept what was written")
+    if job.pairs.is_there():
         return
-    stored, options = StoredFrames.open(folder, table), context.options
+    stored = StoredFrames.open(job.frames.file.parent, table)
     with torch.inference_mode():
         pairs = choose_pairs(stored, job.name, job.role, options)
-        matcher, grid = context.models.matcher(), options.correction_grid
-        files.write(*correct_pairs(stored, pairs, matcher, grid, job.progress))
+        grid = options.correction_grid
+        pairs, flows = correct_pairs(stored, pairs, models.matcher(), grid, job.progress)
+    rows = pa.Table.from_pandas(pairs, preserve_index=False)
+    job.pairs.write(rows, {FLOWS: flows.astype(np.float16)})
+
+
+def reference_frames(depth_share: Float[np.ndarray, " n"], lone: bool) -> Bool[np.ndarray, " n"]:
+    """Which frames may be references."""
+    known = depth_share >= MIN_DEPTH_SHARE
+    return known & ~held_out_mask(len(known)) if lone else known
+
+
+def choose_pairs(frames: StoredFrames, name: str, role: str, options: PrepConfig) -> pd.DataFrame:
+    """A sequence's pairs; a lone sequence has some for training and some for testing."""
+    count, lone = len(frames.depth_share), role == "train and test"
+    angles = pairwise_angles(frames.camera, scene_center(frames.camera))
+    queries = {role: np.ones(count, bool)}
+    if lone:
+        queries = {"train": ~held_out_mask(count), "test": held_out_mask(count)}
+    references = reference_frames(frames.depth_share, lone)
+    parts = []
+    for split, allowed in queries.items():
+        chosen = select_pairs(angles, options, allowed, references)
+        rows = pd.DataFrame(vars(chosen)).astype({"reference": "int32", "query": "int32"})
+        parts.append(rows.assign(sequence=name, split=split))
+    return pd.concat(parts, ignore_index=True)
+
+
+def correct_pairs(
+    frames: StoredFrames,
+    pairs: pd.DataFrame,
+    matcher: Matcher | None,
+    grid: int,
+    progress: bool = False,
+) -> tuple[pd.DataFrame, Float[np.ndarray, "m 2 g g"]]:
+    """The pairs with what correction did for each, and the flows that `flow` numbers.
+
+    Only training pairs are corrected: a correction knows the truth, which a test view must not.
+    `flow` is −1 where the warp stays as it is, with the reason in `uncorrected`.
+    """
+    flows: list[np.ndarray] = []
+    rows = []
+    columns = [pairs[name] for name in ("reference", "query", "split")]
+    bar = track(
+        zip(*columns, strict=True),
+        "correcting",
+        len(pairs),
+        "pairs",
+        shown=progress and matcher is not None,
+    )
+    for reference, query, split in bar:
+        if matcher is None or split != "train":
+            rows.append((-1, np.nan, np.nan, ""))
+            continue
+        found = correct_pair(
+            frames.image(reference),
+            frames.depth(reference),
+            frames.camera[reference],
+            frames.image(query),
+            frames.camera[query],
+            matcher,
+            grid,
+        )
+        number = -1 if found.flow is None else len(flows)
+        if found.flow is not None:
+            flows.append(found.flow.numpy())
+        rows.append((number, found.error_before, found.error_after, found.reason))
+    names = ["flow", "error_before", "error_after", "uncorrected"]
+    made = pd.DataFrame(rows, columns=names).astype(
+        {"flow": "int32", "error_before": "float32", "error_after": "float32"}
+    )
+    stacked = np.stack(flows) if flows else np.zeros((0, 2, grid, grid), np.float32)
+    return pd.concat([pairs, made], axis=1), stacked

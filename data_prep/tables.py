@@ -13,10 +13,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from data_prep.filter import Verdict
-from data_prep.pairs import reference_frames
-from data_prep.sequence_job import PrepContext, SequenceJob
+from data_prep.sequence_job import PrepContext, SequenceJob, reference_frames
 from data_prep.split import Split
-from extrap_train.data.frame_files import read_camera_table
 from extrap_train.data.prepared import FORMAT, TABLES, table_digest
 from extrap_train.data.sequences import FrameSequence
 from extrap_train.errors import InputError
@@ -103,7 +101,7 @@ def write_results(
 def _frame_tables(jobs: list[SequenceJob], counts: Counter[str]) -> Iterator[pa.Table]:
     """Each sequence's frames; counts them by sequence."""
     for job in jobs:
-        cameras = read_camera_table(job.frames_folder, job.frames_key)
+        cameras = job.frames.read()
         if cameras is None:
             raise _vanished_error(job)
         counts[job.name] = cameras.num_rows
@@ -116,7 +114,7 @@ def _frame_tables(jobs: list[SequenceJob], counts: Counter[str]) -> Iterator[pa.
 def _pair_tables(jobs: list[SequenceJob], counts: Counter[tuple[str, str]]) -> Iterator[pa.Table]:
     """Each sequence's pairs; counts them by sequence and split."""
     for job in jobs:
-        pairs = job.pair_files.read()
+        pairs = job.pairs.read()
         if pairs is None:
             raise _vanished_error(job)
         counts.update((job.name, part) for part in pairs["split"].to_pylist())
@@ -124,7 +122,9 @@ def _pair_tables(jobs: list[SequenceJob], counts: Counter[tuple[str, str]]) -> I
 
 
 def _vanished_error(job: SequenceJob) -> InputError:
-    return InputError(f"{job.frames_folder}: vanished or changed meanwhile; run data_prep again")
+    return InputError(
+        f"{job.frames.file.parent}: vanished or changed meanwhile; run data_prep again"
+    )
 
 
 def _sequence_row(

@@ -51,7 +51,7 @@ class StoredFrames:
 
     @classmethod
     def open(cls, folder: Path, table: pa.Table) -> "StoredFrames":
-        """From `read_camera_table`'s table."""
+        """From the folder's table of cameras."""
         height, width = np.load(folder / MASKS, mmap_mode="r").shape[1:]
         camera = Camera(
             matrices_of(table, "world_to_cam", (4, 4)),
@@ -98,8 +98,8 @@ def matrices_of(table: pa.Table, column: str, shape: tuple[int, int]) -> Float[T
     return torch.from_numpy(np.array(values, np.float32).reshape(-1, *shape))
 
 
-def write_frames(folder: Path, frames: SequenceFrames, key: str) -> None:
-    """Write a sequence's folder, whole or not at all; `key` says what it was made from.
+def write_frames(place: "SealedTable", frames: SequenceFrames) -> None:
+    """Write a sequence's frames, whole or not at all.
 
     Depth is stored as float16, divided by a power of two near its median: exact for every scene
     unit, relative precision 2⁻¹¹; what is more than 65,504 medians away becomes unknown.
@@ -107,48 +107,45 @@ def write_frames(folder: Path, frames: SequenceFrames, key: str) -> None:
     scale = _depth_scale(frames.depths)
     scaled = frames.depths / scale
     scaled[scaled > np.finfo(np.float16).max] = 0
-    with atomic_folder(folder, lambda there: is_sealed(there / CAMERAS, key)) as made:
-        arrays = {IMAGES: frames.images, DEPTHS: scaled.astype(np.float16), MASKS: frames.masks}
-        write_sealed(_camera_table(frames, scale), made / CAMERAS, key, arrays)
+    arrays = {IMAGES: frames.images, DEPTHS: scaled.astype(np.float16), MASKS: frames.masks}
+    place.write(_camera_table(frames, scale), arrays)
 
 
-def read_camera_table(folder: Path, key: str) -> pa.Table | None:
-    """One row a frame, if the folder holds a whole sequence made from what `key` says."""
-    return read_sealed(folder / CAMERAS, key)
+@dataclass(frozen=True)
+class SealedTable:
+    """A table that seals the arrays beside it, in a folder that is there whole or not at all.
 
-
-def write_sealed(
-    table: pa.Table, file: Path, key: str, arrays: Mapping[str, Shaped[np.ndarray, "..."]]
-) -> None:
-    """Write arrays by their files' names, and a table beside them that seals them.
-
-    It says by `key` what they were made from, and how long each file must be: what the disk has
-    made of them is compared with that, not with itself.
+    It holds `key`, what it was made from, and how long each file must be: what the disk has made
+    of them is compared with that, not with itself.
     """
-    sizes = {name: save_array(file.parent / name, arrays[name]) for name in sorted(arrays)}
-    seal = {_KEY: key.encode(), _SIZES: json.dumps(sizes).encode()}
-    pq.write_table(table.replace_schema_metadata(seal), file)
 
+    file: Path
+    key: str
 
-def is_sealed(file: Path, key: str) -> bool:
-    """Whether a table is there, made from `key`, and the files beside it are still as long."""
-    try:
-        seal = pq.read_schema(file).metadata or {}
-        sizes = TypeAdapter(dict[str, int]).validate_json(seal.get(_SIZES, b""), strict=True)
-    except (OSError, pa.ArrowException, ValidationError):
-        return False
-    if seal.get(_KEY) != key.encode():
-        return False
-    stamps = ((file_stamp(file.with_name(name)), size) for name, size in sizes.items())
-    return all(stamp is not None and stamp[0] == size for stamp, size in stamps)
+    def is_there(self) -> bool:
+        """Whether the table is there, made from `key`, and the files beside it are as long."""
+        try:
+            seal = pq.read_schema(self.file).metadata or {}
+            sizes = TypeAdapter(dict[str, int]).validate_json(seal.get(_SIZES, b""), strict=True)
+        except (OSError, pa.ArrowException, ValidationError):
+            return False
+        stamps = [(file_stamp(self.file.with_name(name)), size) for name, size in sizes.items()]
+        is_whole = all(stamp is not None and stamp[0] == size for stamp, size in stamps)
+        return seal.get(_KEY) == self.key.encode() and is_whole
 
+    def read(self) -> pa.Table | None:
+        """The table, if `is_there`."""
+        try:
+            return pq.read_table(self.file) if self.is_there() else None
+        except (OSError, pa.ArrowException):
+            return None
 
-def read_sealed(file: Path, key: str) -> pa.Table | None:
-    """The table, if `is_sealed`."""
-    try:
-        return pq.read_table(file) if is_sealed(file, key) else None
-    except (OSError, pa.ArrowException):
-        return None
+    def write(self, table: pa.Table, arrays: Mapping[str, Shaped[np.ndarray, "..."]]) -> None:
+        """Write the arrays by their files' names, and the table; what is there whole stays."""
+        with atomic_folder(self.file.parent, lambda _: self.is_there()) as made:
+            sizes = {name: save_array(made / name, arrays[name]) for name in sorted(arrays)}
+            seal = {_KEY: self.key.encode(), _SIZES: json.dumps(sizes).encode()}
+            pq.write_table(table.replace_schema_metadata(seal), made / self.file.name)
 
 
 def _camera_table(frames: SequenceFrames, depth_scale: float) -> pa.Table:

@@ -14,9 +14,9 @@ from orbits import capture, even, ring
 from data_prep.preparation import prepare
 from extrap_train.config import PrepConfig
 from extrap_train.data.frame_files import (
+    SealedTable,
     SequenceFrames,
     frames_folder,
-    read_camera_table,
     write_frames,
 )
 from extrap_train.data.prepared import PreparedData
@@ -99,12 +99,13 @@ def test_depth_survives_in_any_unit(exponent: float, seed: int, tmp_path_factory
     bytes_ = np.zeros((2, 4, 4), np.uint8)
     camera = ring(even(2))
     frames = SequenceFrames(("x", "y"), camera, np.stack([bytes_] * 3, -1), depths, bytes_)
-    write_frames(target, frames, "key")
-    table = read_camera_table(target, "key")
+    place = SealedTable(target / "frames.parquet", "key")
+    write_frames(place, frames)
+    table = place.read()
     assert table is not None
     stored = np.load(target / "depth.npy").astype(np.float32) * table["depth_scale"][0].as_py()
     np.testing.assert_allclose(stored, depths, rtol=2**-11)
-    assert read_camera_table(target, "another key") is None
+    assert SealedTable(place.file, "another key").read() is None
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 import torch
 from orbits import capture, even, ring, textured_capture
 
-from data_prep import pairs
+from data_prep import sequence_job
 from data_prep.model_cache import PrepModels
 from data_prep.preparation import prepare
 from data_prep.sequence_job import PrepContext, SequenceJob, prepare_sequence
@@ -208,7 +208,7 @@ def test_a_frame_without_depth_is_no_reference(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("module", "file"), [(frame_files, "IMAGES"), (frame_files, "MASKS"), (pairs, "FLOWS")]
+    ("module", "file"), [(frame_files, "IMAGES"), (frame_files, "MASKS"), (sequence_job, "FLOWS")]
 )
 def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
     module: ModuleType, file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -218,7 +218,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
         run(tmp_path / "cup", captures(2))
     assert str(tmp_path / "cup") in str(caught.value)
     made = [path for path in (tmp_path / "cup").rglob("*.npy") if path.is_file()]
-    assert len(made) == (3 if module is pairs else 0), "the frames of one sequence"
+    assert len(made) == (3 if module is sequence_job else 0), "the frames of one sequence"
     assert not list((tmp_path / "cup").rglob("*.tmp"))
 
 
