@@ -4,13 +4,13 @@ import math
 import os
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast, overload
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Shaped
 
 from extrap_train.data.co3d.annotations import VIEWPOINT, FrameAnnotation
 from extrap_train.data.paths import file_stamp
@@ -23,90 +23,57 @@ from extrap_train.views import Camera
 _JPEG_HEADER_BYTES, _BLACK_PIXELS_PER_BYTE = 1024, 32
 
 
-@dataclass(frozen=True)
-class _Cameras:
-    """One row per frame; those that are not sound must not be used."""
-
-    world_to_cam: Float[np.ndarray, "n 4 4"]
-    intrinsics: Float[np.ndarray, "n 3 3"]
-    sound: Bool[np.ndarray, " n"]
-
-
 @dataclass(frozen=True, eq=False)
 class Co3dFrames(Sequence[Frame]):
     """Some frames of one sequence; each is made when it is asked for.
 
-    Columns with one row per frame, about 350 bytes instead of the 7,000 of as many small objects.
+    A table with one row per frame, about 350 bytes instead of the 7,000 of as many small objects.
     Paths are the system's bytes, empty where there is no file.
     """
 
     root: Path
-    number: Int[np.ndarray, " n"]
-    size: Int[np.ndarray, "n 2"]
-    """(height, width) in pixels."""
-    world_to_cam: Float[np.ndarray, "n 4 4"]
-    intrinsics: Float[np.ndarray, "n 3 3"]
-    image_path: Shaped[np.ndarray, " n"]
-    mask_path: Shaped[np.ndarray, " n"]
-    depth_path: Shaped[np.ndarray, " n"]
-    depth_mask_path: Shaped[np.ndarray, " n"]
-    depth_scale: Float[np.ndarray, " n"]
+    table: Shaped[np.ndarray, " n"]
 
     @classmethod
     def of(
         cls, root: Path, annotations: list[FrameAnnotation], file: Path
     ) -> tuple["Co3dFrames", tuple[str, ...]]:
         """In the annotations' order, and why some are left out: their camera is degenerate."""
-        cameras = _convert_cameras(annotations)
-        frames = cls._of(root, annotations, cameras)
-        if cameras.sound.all():
-            return frames, ()
-        unsound = [annotations[i] for i in np.flatnonzero(~cameras.sound)]
+        cameras, sound = _convert_cameras(annotations)
+        depths = [annotation.depth for annotation in annotations]
+        columns = {
+            "number": np.array([annotation.number for annotation in annotations], np.int64),
+            "size": np.array([annotation.size for annotation in annotations], np.int32),
+            **cameras,
+            "image_path": _encode(annotation.image_path for annotation in annotations),
+            "mask_path": _encode(annotation.mask_path for annotation in annotations),
+            "depth_path": _encode(depth.path if depth else None for depth in depths),
+            "depth_mask_path": _encode(depth.mask_path if depth else None for depth in depths),
+            "depth_scale": np.array([depth.scale if depth else 0.0 for depth in depths]),
+        }
+        kinds = [(name, column.dtype, column.shape[1:]) for name, column in columns.items()]
+        table = np.empty(len(annotations), kinds)
+        for name, column in columns.items():
+            table[name] = column
+        unsound = [annotations[i] for i in np.flatnonzero(~sound)]
         reasons = tuple(
             degenerate_camera(f"{frame.sequence} frame {frame.number}", file) for frame in unsound
         )
-        return frames._take(cameras.sound), reasons
-
-    @classmethod
-    def _of(cls, root: Path, annotations: list[FrameAnnotation], cameras: _Cameras) -> "Co3dFrames":
-        depths = [annotation.depth for annotation in annotations]
-        return cls(
-            root=root,
-            number=np.array([annotation.number for annotation in annotations], np.int64),
-            size=np.array([annotation.size for annotation in annotations], np.int32),
-            world_to_cam=cameras.world_to_cam,
-            intrinsics=cameras.intrinsics,
-            image_path=_encode(annotation.image_path for annotation in annotations),
-            mask_path=_encode(annotation.mask_path for annotation in annotations),
-            depth_path=_encode(depth.path if depth else None for depth in depths),
-            depth_mask_path=_encode(depth.mask_path if depth else None for depth in depths),
-            depth_scale=np.array([depth.scale if depth else 0.0 for depth in depths]),
-        )
+        return cls(root, table[sound]), reasons
 
     @classmethod
     def join(cls, parts: Sequence["Co3dFrames"]) -> "Co3dFrames":
         """All frames of the parts, by number."""
-        columns = {
-            name: np.concatenate([getattr(part, name) for part in parts]) for name in cls._columns()
-        }
-        together = cls(root=parts[0].root, **columns)
-        return together._take(np.argsort(together.number, kind="stable"))
-
-    @classmethod
-    def _columns(cls) -> list[str]:
-        return [field.name for field in fields(cls) if field.name != "root"]
-
-    def _take(self, rows: Shaped[np.ndarray, " m"]) -> "Co3dFrames":
-        """These rows alone, by their indices or a mask."""
-        return replace(self, **{name: getattr(self, name)[rows] for name in self._columns()})
+        table = np.concatenate([part.table for part in parts])
+        return cls(parts[0].root, table[np.argsort(table["number"], kind="stable")])
 
     @property
     def has_duplicates(self) -> bool:
         """Whether a photograph is listed twice."""
-        return len(np.unique(self.image_path)) < len(self)
+        return len(np.unique(self.table["image_path"])) < len(self)
 
     def __len__(self) -> int:
-        return len(self.number)
+        return len(self.table)
 
     @overload
     def __getitem__(self, index: int) -> Frame: ...
@@ -120,33 +87,24 @@ class Co3dFrames(Sequence[Frame]):
         return self._frame(index)
 
     def _frame(self, index: int) -> Frame:
-        height, width = self.size[index].tolist()
+        row = self.table[index]
+        height, width = row["size"].tolist()
         # Copied: a frame that is sent to another process must not take its whole sequence along.
         camera = Camera(
-            torch.tensor(self.world_to_cam[index]),
-            torch.tensor(self.intrinsics[index]),
-            height,
-            width,
+            torch.tensor(row["world_to_cam"]), torch.tensor(row["intrinsics"]), height, width
         )
-        image_path = os.fsdecode(self.image_path[index])
+        image, mask, depth, depth_mask = (
+            os.fsdecode(row[f"{kind}_path"]) for kind in ("image", "mask", "depth", "depth_mask")
+        )
+        scale = float(row["depth_scale"])
         return PhotographLoader(
             root=self.root,
-            name=image_path.rpartition("/")[2],
+            name=image.rpartition("/")[2],
             camera=camera,
-            image_path=image_path,
-            mask_path=os.fsdecode(self.mask_path[index]) or None,
-            depth=self._depth(index),
+            image_path=image,
+            mask_path=mask or None,
+            depth=DepthFile(depth, scale, depth_mask or None, True) if depth else None,
         ).frame()
-
-    def _depth(self, index: int) -> DepthFile | None:
-        if not self.depth_path[index]:
-            return None
-        return DepthFile(
-            os.fsdecode(self.depth_path[index]),
-            float(self.depth_scale[index]),
-            os.fsdecode(self.depth_mask_path[index]) or None,
-            is_half_float=True,
-        )
 
 
 def is_blackened(root: Path, annotation: FrameAnnotation) -> bool:
@@ -166,8 +124,13 @@ def _encode(paths: Iterable[str | None]) -> Shaped[np.ndarray, " n"]:
     return np.array([os.fsencode(path or "") for path in paths])
 
 
-def _convert_cameras(annotations: list[FrameAnnotation]) -> _Cameras:
-    """One camera per frame, converted together where size and format agree (one by one is slow)."""
+def _convert_cameras(
+    annotations: list[FrameAnnotation],
+) -> tuple[dict[str, Shaped[np.ndarray, "n ..."]], Bool[np.ndarray, " n"]]:
+    """World-to-camera and intrinsics of each frame, and whether they are sound.
+
+    They are converted together where size and format agree: one by one is slow.
+    """
     groups: dict[tuple[tuple[int, int], str], list[int]] = defaultdict(list)
     for index, annotation in enumerate(annotations):
         groups[annotation.size, annotation.intrinsics_format].append(index)
@@ -180,7 +143,7 @@ def _convert_cameras(annotations: list[FrameAnnotation]) -> _Cameras:
         world_to_cam[members] = batch.world_to_cam.numpy()
         intrinsics[members] = batch.intrinsics.numpy()
         sound[members] = ~is_degenerate(batch).numpy()
-    return _Cameras(world_to_cam, intrinsics, sound)
+    return {"world_to_cam": world_to_cam, "intrinsics": intrinsics}, sound
 
 
 def _convert_batch(annotations: list[FrameAnnotation], height: int, width: int, ndc: str) -> Camera:
