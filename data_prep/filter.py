@@ -9,10 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from extrap_train.config import PrepConfig
-from extrap_train.data.camera_check import CO3D_POSES, find_pose_fault
+from extrap_train.data.camera_check import CO3D_POSES, find_pose_fault, is_degenerate
 from extrap_train.data.sequences import FrameSequence
 from extrap_train.data.square_frames import too_many_unusable
-from extrap_train.data.validation import is_degenerate
 from extrap_train.geometry.viewpoints import LOOKS_AT_RAD, facing, fit_orbit, scene_center
 from extrap_train.views import Camera, stack_poses
 

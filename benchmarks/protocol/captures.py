@@ -20,14 +20,13 @@ from extrap_train.config import (
     SyntheticConfig,
 )
 from extrap_train.data.co3d import read_category
-from extrap_train.data.json_files import read_json
+from extrap_train.data.json_files import read_json, require_list
 from extrap_train.data.photographs import CATEGORY as NO_CATEGORY
 from extrap_train.data.scene import open_scene
 from extrap_train.data.sequences import FrameSequence
 from extrap_train.data.synthetic import build_scene, surface_points
 from extrap_train.data.synthetic.capture import synthetic_sequence
 from extrap_train.data.transforms_json import TRANSFORMS, read_transforms
-from extrap_train.data.validation import require_list
 from extrap_train.errors import InputError
 from extrap_train.store.cache import read_manifest
 from extrap_train.store.manifest import MANIFEST, Split

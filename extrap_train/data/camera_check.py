@@ -1,16 +1,19 @@
-"""Whether a capture's cameras can see something in common, and the likely cause where they cannot.
+"""Whether cameras are sound, and whether those of a capture can see something in common.
 
-One check for every task: captures pass it when they are opened. Poses in another convention look
-sound one by one; together they stand in one place, or look away from each other.
+Every capture passes the second check when it is opened, whatever the task. Poses in another
+convention look sound one by one; together they stand in one place, or look away from each other.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from extrap_train.errors import InputError
 from extrap_train.geometry.opengl import (
     flip_up_and_forward,
     opengl_from_world_to_cam,
@@ -36,6 +39,43 @@ LEAST_SHARE, NEARLY_ALL = 1 / 3, 0.9
 """Of cameras that look at one point: too few below it, and enough to name a convention."""
 CLEARLY_RAD = np.deg2rad(5)
 """By so much, and twofold, must another convention bring the axes nearer to one point."""
+
+ROTATION_TOLERANCE = 1e-3
+"""Largest deviation of R Rᵀ from the identity; rotations stored as float32 stay below 1e-5."""
+
+FOCAL_SIDES = (1e-3, 1e4)
+"""Of focal lengths, in sides of the picture; a crop may be a small part of its photograph."""
+CENTRE_SIDES = 1e3
+"""How far outside of the picture the principal point of a crop may lie, in its sides."""
+
+
+def is_degenerate(camera: Camera) -> Bool[Tensor, "*b"]:
+    """Whether a camera is not finite, has no rotation, or a lens that no camera has."""
+    rotation, intrinsics = camera.world_to_cam[..., :3, :3], camera.intrinsics
+    finite = (camera.world_to_cam.sum((-2, -1)) + intrinsics.sum((-2, -1))).isfinite()
+    deviation = (rotation @ rotation.mT - torch.eye(3, dtype=rotation.dtype)).abs().amax((-2, -1))
+    right_handed = torch.linalg.det(rotation.nan_to_num()) > 0
+    side = max(camera.height, camera.width)
+    focal = intrinsics.diagonal(dim1=-2, dim2=-1)[..., :2] / side
+    plausible = ((focal > FOCAL_SIDES[0]) & (focal < FOCAL_SIDES[1])).all(-1)
+    centred = (intrinsics[..., :2, 2].abs() < CENTRE_SIDES * side).all(-1)
+    return ~(finite & (deviation < ROTATION_TOLERANCE) & right_handed & plausible & centred)
+
+
+def degenerate_camera(name: str, file: Path) -> str:
+    """What to say of one that was read from `file`."""
+    return (
+        f"{file}: the camera of {name} is degenerate (NaN, no rotation, or a focal length or "
+        "centre that fits no picture of its size); correct or remove its entry"
+    )
+
+
+def require_sound(cameras: Camera, names: Collection[str], file: Path) -> None:
+    """Raise InputError that names the first degenerate camera of those read from `file`."""
+    for name, degenerate in zip(names, is_degenerate(cameras).tolist(), strict=True):
+        if degenerate:
+            raise InputError(degenerate_camera(name, file))
+
 
 Reread = Callable[[Float[Tensor, "n 4 4"]], Float[Tensor, "n 4 4"]]
 

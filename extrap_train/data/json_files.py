@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from extrap_train.data.paths import require_file
-from extrap_train.data.validation import require_list
 from extrap_train.errors import InputError
 
 MAX_JSON_BYTES = 64 * 2**20
@@ -164,3 +163,23 @@ def _refuse(path: Path, error: Exception) -> NoReturn:
     # Where in the file is not known any more, and no matter.
     reason = error.msg if isinstance(error, json.JSONDecodeError) else error
     raise InputError(f"{path}: is not valid JSON ({reason}); download it again") from None
+
+
+def require_list(content: Any, what: str, file: Path) -> list[Any]:
+    """`content`, if it is a list with something in it."""
+    if not isinstance(content, list) or not content:
+        raise InputError(
+            f"{file}: expected {what} in a list, found {_kind(content)}; check the file"
+        )
+    return content
+
+
+def require_dict(content: Any, what: str, file: Path) -> dict[str, Any]:
+    """`content`, if it is a JSON object."""
+    if not isinstance(content, dict):
+        raise InputError(f"{file}: expected {what}, found {_kind(content)}; check the file")
+    return content
+
+
+def _kind(content: Any) -> str:
+    return "an empty list" if content == [] else f"a {type(content).__name__}"

@@ -9,12 +9,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrap_train.data.camera_check import OPENGL_POSES
-from extrap_train.data.json_files import read_json
+from extrap_train.data.json_files import read_json, require_dict, require_list
 from extrap_train.data.lens_keys import LENS_KEYS, lens_of, merge_entry
 from extrap_train.data.listed_files import ListedFiles
 from extrap_train.data.paths import check_relative
-from extrap_train.data.photograph_loader import DepthFile
 from extrap_train.data.photographs import (
+    DepthFile,
     Listed,
     Photograph,
     pinhole_camera,
@@ -22,7 +22,6 @@ from extrap_train.data.photographs import (
 )
 from extrap_train.data.picture_files import MAX_PIXELS, image_size
 from extrap_train.data.sequences import FrameSequence, PointCloud
-from extrap_train.data.validation import require_dict, require_list
 from extrap_train.errors import InputError
 from extrap_train.geometry.opengl import world_to_cam_from_opengl
 from extrap_train.views import Camera, stack_cameras

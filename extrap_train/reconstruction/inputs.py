@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
+from extrap_train.data.camera_check import is_degenerate
 from extrap_train.data.sequences import Frame
-from extrap_train.data.validation import is_degenerate
 from extrap_train.depth import RELIABLE_CONFIDENCE, DepthSource
 from extrap_train.errors import InputError
 from extrap_train.geometry.orbits import fit_circle

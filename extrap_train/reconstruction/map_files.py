@@ -14,7 +14,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
-from extrap_train.data.validation import is_degenerate
+from extrap_train.data.camera_check import is_degenerate
 from extrap_train.errors import InputError
 from extrap_train.reconstruction.completion import Step
 from extrap_train.reconstruction.global_map import GlobalMap, MapView, Origin

@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Shaped
 
+from extrap_train.data.camera_check import degenerate_camera, is_degenerate
 from extrap_train.data.co3d.annotations import VIEWPOINT, FrameAnnotation
 from extrap_train.data.paths import file_stamp
-from extrap_train.data.photograph_loader import DepthFile, PhotographLoader
+from extrap_train.data.photographs import DepthFile, PhotographLoader
 from extrap_train.data.sequences import Frame
-from extrap_train.data.validation import degenerate_camera, is_degenerate
 from extrap_train.geometry.pytorch3d import NdcFormat, Viewpoint, camera_from_viewpoint
 from extrap_train.views import Camera
 

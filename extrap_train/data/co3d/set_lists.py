@@ -4,9 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from extrap_train.data.json_files import read_json
+from extrap_train.data.json_files import read_json, require_dict
 from extrap_train.data.paths import check_relative
-from extrap_train.data.validation import require_dict
 from extrap_train.errors import InputError
 
 

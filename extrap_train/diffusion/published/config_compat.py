@@ -11,8 +11,7 @@ from typing import Any
 
 from transformers import CLIPVisionConfig
 
-from extrap_train.data.json_files import read_json
-from extrap_train.data.validation import require_dict
+from extrap_train.data.json_files import read_json, require_dict
 from extrap_train.errors import InputError
 
 SCHEDULER = "scheduler"
