@@ -13,8 +13,8 @@ from extrap_train.config import MonocularConfig
 from extrap_train.depth import DepthMap, PointMaps, point_maps_of
 from extrap_train.depth.neighbours import WIDEST_RAD, neighbours_of
 from extrap_train.errors import InputError
+from extrap_train.geometry.epipolar import triangulate
 from extrap_train.geometry.resample import sample_pixels
-from extrap_train.geometry.triangulation import triangulate
 from extrap_train.matching import Matcher
 from extrap_train.views import View, combine
 

@@ -12,9 +12,6 @@ from torch.nn import functional
 
 from extrap_train.views import PairBatch, Warp
 
-WARP_SCALE = 2
-"""Side of the warp over that of what is made from it, where no model says it."""
-
 
 def reduce_batch(batch: PairBatch, factor: int) -> PairBatch:
     """The batch with everything in it, its warp too, at 1/`factor` of its size.

@@ -2,7 +2,7 @@ import torch
 from scenes import orbit_camera
 
 from extrap_train.geometry.cameras import project
-from extrap_train.geometry.triangulation import triangulate
+from extrap_train.geometry.epipolar import triangulate
 
 FIRST, SECOND = orbit_camera(0), orbit_camera(30)
 
