@@ -20,8 +20,7 @@ GZIP_FLOOR_BYTES = 32 * 2**20
 GZIP_RATIO = 40
 """Annotations shrink to between a third and a tenth; a decompression bomb, to a thousandth."""
 _PIECE_BYTES = 2**18
-_SPACE = " \t\r\n"
-_CUT_NUMBER = re.compile(r"[-+.eE0-9]*\Z")
+_SPACES = re.compile(r"[ \t\r\n]*")
 
 
 def read_json(path: Path) -> Any:
@@ -60,7 +59,7 @@ def read_json_list(path: Path, what: str) -> Iterator[Any]:
 
 
 class _Text:
-    """A file's text from one place on, read on as far as is needed."""
+    """A file's text from one place on, of which the largest entry is always at hand."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -71,12 +70,14 @@ class _Text:
     def peek(self) -> str:
         """The next character that is no space; empty at the end."""
         while True:
-            while self._at < len(self._text):
-                if self._text[self._at] not in _SPACE:
-                    return self._text[self._at]
-                self._at += 1
-            if not self._read_on(1):
-                return ""
+            while len(self._text) - self._at <= MAX_ENTRY_BYTES:
+                if not (piece := next(self._pieces, "")):
+                    break
+                self._text, self._at = self._text[self._at :] + piece, 0
+            self._at = _SPACES.match(self._text, self._at).end()  # type: ignore[union-attr]
+            if self._at < len(self._text) or not self._text:
+                return self._text[self._at : self._at + 1]
+            self._text, self._at = "", 0
 
     def take(self) -> str:
         """The same, and go past it."""
@@ -87,36 +88,18 @@ class _Text:
     def value(self) -> Any:
         """The value that begins here."""
         self.peek()
-        while True:
-            try:
-                value, end = self._decode(self._text, self._at)
-            except (ValueError, RecursionError) as error:
-                # Cut off by the piece's end, or wrong? Twice as much each time, so that a long
-                # value is not begun more often than its length has digits.
-                begun = len(self._text) - self._at
-                if begun > MAX_ENTRY_BYTES:
-                    raise _too_large(self.path, "has an entry of", MAX_ENTRY_BYTES) from None
-                if isinstance(error, RecursionError) or not self._read_on(begun):
-                    _refuse(self.path, error)
-                continue
-            # A number may go on in the next piece, and of `1.` or `1e-` only the 1 is a value.
-            if _CUT_NUMBER.match(self._text, end) and self._read_on(1):
-                continue
-            if end - self._at > MAX_ENTRY_BYTES:
-                raise _too_large(self.path, "has an entry of", MAX_ENTRY_BYTES)
-            self._at = end
-            return value
-
-    def _read_on(self, least: int) -> bool:
-        """At least so many more characters, if there are any; what lies behind is forgotten."""
-        parts, length = [self._text[self._at :]], 0
-        for piece in self._pieces:
-            parts.append(piece)
-            length += len(piece)
-            if length >= least:
-                break
-        self._text, self._at = "".join(parts), 0
-        return length > 0
+        try:
+            value, end = self._decode(self._text, self._at)
+        except (ValueError, RecursionError) as error:
+            if len(self._text) - self._at > MAX_ENTRY_BYTES and not isinstance(
+                error, RecursionError
+            ):
+                raise _too_large(self.path, "has an entry of", MAX_ENTRY_BYTES) from None
+            _refuse(self.path, error)
+        if end - self._at > MAX_ENTRY_BYTES:
+            raise _too_large(self.path, "has an entry of", MAX_ENTRY_BYTES)
+        self._at = end
+        return value
 
 
 def _decode_pieces(path: Path) -> Iterator[str]:
