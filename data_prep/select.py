@@ -1,7 +1,6 @@
 """Which frames of a sequence become pairs (METHOD §6, paper III-A.1)."""
 
 from dataclasses import dataclass
-from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -70,8 +69,7 @@ def _candidates(
 
 
 @compiled()
-@no_type_check
-def _greedy(first, second, near, max_uses):  # noqa: ANN001, ANN202
+def _greedy(first, second, near, max_uses):
     """Which candidates, in their order, are taken."""
     count = len(near)
     uses = np.zeros(count, np.int64)

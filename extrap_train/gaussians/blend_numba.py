@@ -62,7 +62,7 @@ _P0, _P1, _P2, _P3, _P4, _P5, _P6, _P7 = _power_of_two()
 
 
 @compiled(contract=True)
-def alpha_of(log_alpha: np.floating) -> np.floating:
+def alpha_of(log_alpha):
     """2 to that power, and zero where it is below 1/255; at most 1."""
     x = np.minimum(np.maximum(log_alpha, MIN_LOG), ZERO) * _QUARTER
     low = _P0 + x * (_P1 + x * (_P2 + x * _P3))
@@ -74,9 +74,7 @@ def alpha_of(log_alpha: np.floating) -> np.floating:
 
 
 @compiled(contract=True)
-def place(
-    ellipse: np.ndarray, top: int, left: int
-) -> tuple[float, float, tuple[int, int, int, int]]:
+def place(ellipse, top, left):
     """The mean in the tile's coordinates (pixel centres whole), and the blocks that it reaches
     there: first and one past the last column, first and one past the last row."""
     u, v = np.float64(ellipse[U]) - left - 0.5, np.float64(ellipse[V]) - top - 0.5
@@ -89,14 +87,14 @@ def place(
 
 
 @compiled()
-def pixel_of(y: int, x: int) -> int:
+def pixel_of(y, x):
     """Where a tile's pixel lies in a plane."""
     block = y // SIDE * ACROSS + x // SIDE
     return block * LANES + y % SIDE * SIDE + x % SIDE
 
 
 @compiled()
-def gather(packed: np.ndarray, gaussians: np.ndarray, batch: np.ndarray) -> None:
+def gather(packed, gaussians, batch):
     """Copy the ellipses of a batch."""
     for k in range(len(gaussians)):
         for c in range(COLUMNS):
@@ -108,15 +106,7 @@ _MIN_LIGHT = np.float32(1e-4)
 
 
 @compiled(parallel=True, contract=True)
-def blend(
-    packed: np.ndarray,
-    background: np.ndarray,
-    starts: np.ndarray,
-    gaussians: np.ndarray,
-    image: np.ndarray,
-    transmittance: np.ndarray,
-    ends: np.ndarray,
-) -> None:
+def blend(packed, background, starts, gaussians, image, transmittance, ends):
     """Fill the last three: up to four channels (h w d), the light that is left, and the number of
     the tile's last overlap that counts, from 1."""
     columns = -(-image.shape[1] // TILE)
@@ -140,9 +130,7 @@ def blend(
 
 
 @compiled(contract=True)
-def _blend_tile(
-    packed: np.ndarray, gaussians: np.ndarray, top: int, left: int, planes: np.ndarray
-) -> None:
+def _blend_tile(packed, gaussians, top, left, planes):
     alive = np.ones(BLOCKS, np.bool_)
     batch = np.empty((BATCH, COLUMNS), packed.dtype)
     for start in range(0, len(gaussians), BATCH):
@@ -162,9 +150,7 @@ def _blend_tile(
 
 
 @compiled(contract=True)
-def _blend_block(
-    pixels: np.ndarray, ellipse: np.ndarray, center: tuple[float, float], overlap: int
-) -> None:
+def _blend_block(pixels, ellipse, center, overlap):
     """Blend an ellipse into the block; `center` is its mean relative to the first pixel."""
     u, v, number = pixels.dtype.type(center[0]), pixels.dtype.type(center[1]), np.float32(overlap)
     precision, slope = ellipse[PRECISION], ellipse[SLOPE]
@@ -190,7 +176,7 @@ def _blend_block(
 
 
 @compiled()
-def _find_alive(planes: np.ndarray, alive: np.ndarray) -> bool:
+def _find_alive(planes, alive):
     """Mark the blocks that any light passes through, and say whether there are any."""
     some = False
     for block in range(len(alive)):
@@ -204,17 +190,17 @@ def _find_alive(planes: np.ndarray, alive: np.ndarray) -> bool:
 
 @compiled(parallel=True, contract=True)
 def blend_backward(
-    packed: np.ndarray,
-    background: np.ndarray,
-    starts: np.ndarray,
-    gaussians: np.ndarray,
-    slots: np.ndarray,
-    transmittance: np.ndarray,
-    ends: np.ndarray,
-    image_grad: np.ndarray,
-    transmittance_grad: np.ndarray,
-    moments: np.ndarray,
-) -> None:
+    packed,
+    background,
+    starts,
+    gaussians,
+    slots,
+    transmittance,
+    ends,
+    image_grad,
+    transmittance_grad,
+    moments,
+):
     """Fill the slots with the moments (slots MOMENTS) of each overlap."""
     height, width, channels = image_grad.shape
     columns = -(-width // TILE)
@@ -236,15 +222,7 @@ def blend_backward(
 
 
 @compiled(contract=True)
-def _tile_backward(
-    packed: np.ndarray,
-    gaussians: np.ndarray,
-    slots: np.ndarray,
-    top: int,
-    left: int,
-    planes: np.ndarray,
-    moments: np.ndarray,
-) -> None:
+def _tile_backward(packed, gaussians, slots, top, left, planes, moments):
     ends = np.zeros(BLOCKS, np.int64)
     for pixel in range(PIXELS):
         block = pixel // LANES
@@ -271,13 +249,7 @@ def _tile_backward(
 
 
 @compiled(contract=True)
-def _block_backward(
-    pixels: np.ndarray,
-    ellipse: np.ndarray,
-    center: tuple[float, float],
-    overlap: int,
-    sums: np.ndarray,
-) -> None:
+def _block_backward(pixels, ellipse, center, overlap, sums):
     """Take an ellipse off a block, and add what the gradients of the pixels say."""
     u, v, number = pixels.dtype.type(center[0]), pixels.dtype.type(center[1]), np.float32(overlap)
     precision, slope = ellipse[PRECISION], ellipse[SLOPE]
@@ -315,7 +287,7 @@ def _block_backward(
 
 
 @compiled()
-def _add_lanes(sums: np.ndarray, moments: np.ndarray) -> None:
+def _add_lanes(sums, moments):
     """Sum the lanes of each moment, halves first; `sums` is used up."""
     for i in range(MOMENTS):
         lanes = sums[i * LANES : (i + 1) * LANES]

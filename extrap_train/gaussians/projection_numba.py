@@ -20,17 +20,7 @@ _BLOCK = 256
 
 
 @compiled(parallel=True)
-def project_forward(
-    means: np.ndarray,
-    quats: np.ndarray,
-    scales: np.ndarray,
-    opacities: np.ndarray,
-    lens: tuple[np.ndarray, np.ndarray, int, int, float, float],
-    means2d: np.ndarray,
-    shapes: np.ndarray,
-    depths: np.ndarray,
-    radii: np.ndarray,
-) -> None:
+def project_forward(means, quats, scales, opacities, lens, means2d, shapes, depths, radii):
     """Fill the four outputs; zeros for what is not drawn.
 
     `lens` is world_to_cam, intrinsics, width, height, near plane and low pass.
@@ -64,19 +54,19 @@ def project_forward(
 
 @compiled(parallel=True)
 def project_backward(
-    means: np.ndarray,
-    quats: np.ndarray,
-    scales: np.ndarray,
-    lens: tuple[np.ndarray, np.ndarray, int, int, float, float],
-    radii: np.ndarray,
-    means2d_grad: np.ndarray,
-    shapes_grad: np.ndarray,
-    depths_grad: np.ndarray,
-    means_grad: np.ndarray,
-    quats_grad: np.ndarray,
-    scales_grad: np.ndarray,
-    pose_grads: np.ndarray,
-) -> None:
+    means,
+    quats,
+    scales,
+    lens,
+    radii,
+    means2d_grad,
+    shapes_grad,
+    depths_grad,
+    means_grad,
+    quats_grad,
+    scales_grad,
+    pose_grads,
+):
     """Fill the last four: `pose_grads` (blocks 3 4, zeros before) is to be summed over blocks."""
     world_to_cam, k, width, height, _, low_pass = lens
     for block in numba.prange(-(-len(means) // _BLOCK)):
@@ -117,7 +107,7 @@ def pose_blocks(count: int) -> int:
 
 
 @compiled()
-def _to_camera(world_to_cam: np.ndarray, point: np.ndarray) -> tuple[float, float, float]:
+def _to_camera(world_to_cam, point):
     m, x, y, z = world_to_cam, point[0], point[1], point[2]
     return (
         m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3],
@@ -127,7 +117,7 @@ def _to_camera(world_to_cam: np.ndarray, point: np.ndarray) -> tuple[float, floa
 
 
 @compiled()
-def _unit(quat: np.ndarray) -> tuple[float, float, float, float, float]:
+def _unit(quat):
     """The quaternion normalised, and 1 / its length."""
     w, x, y, z = (
         np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
@@ -137,7 +127,7 @@ def _unit(quat: np.ndarray) -> tuple[float, float, float, float, float]:
 
 
 @compiled()
-def _turn(quat: np.ndarray, turn: np.ndarray) -> None:
+def _turn(quat, turn):
     """Rotation matrix of a quaternion."""
     w, x, y, z, _ = _unit(quat)
     turn[0, 0], turn[1, 1] = 1 - 2 * (y * y + z * z), 1 - 2 * (x * x + z * z)
@@ -148,7 +138,7 @@ def _turn(quat: np.ndarray, turn: np.ndarray) -> None:
 
 
 @compiled()
-def _turn_backward(quat: np.ndarray, g: np.ndarray, quat_grad: np.ndarray) -> None:
+def _turn_backward(quat, g, quat_grad):
     w, x, y, z, inverse = _unit(quat)
     along_w = x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1])
     along_x = y * (g[0, 1] + g[1, 0]) + z * (g[0, 2] + g[2, 0]) - 2 * x * (g[1, 1] + g[2, 2])
@@ -165,9 +155,7 @@ def _turn_backward(quat: np.ndarray, g: np.ndarray, quat_grad: np.ndarray) -> No
 
 
 @compiled()
-def _carry_axes(
-    world_to_cam: np.ndarray, turn: np.ndarray, scale: np.ndarray, axes: np.ndarray
-) -> None:
+def _carry_axes(world_to_cam, turn, scale, axes):
     """The Gaussian's axes in the camera's frame, one a column, as long as its deviations."""
     for row in range(3):
         for axis in range(3):
@@ -178,15 +166,7 @@ def _carry_axes(
 
 
 @compiled()
-def _axes_backward(
-    world_to_cam: np.ndarray,
-    turn: np.ndarray,
-    scale: np.ndarray,
-    axes_grad: np.ndarray,
-    turn_grad: np.ndarray,
-    scale_grad: np.ndarray,
-    pose_grad: np.ndarray,
-) -> None:
+def _axes_backward(world_to_cam, turn, scale, axes_grad, turn_grad, scale_grad, pose_grad):
     for axis in range(3):
         along = 0.0
         for j in range(3):
@@ -200,7 +180,7 @@ def _axes_backward(
 
 
 @compiled()
-def _slope(ratio: float, focal: float, center: float, size: int) -> tuple[float, bool]:
+def _slope(ratio, focal, center, size):
     """Clamped x/z (or y/z), and whether the clamp let it be."""
     margin = _VIEW_MARGIN * 0.5 * size / focal
     least, most = -center / focal - margin, (size - center) / focal + margin
@@ -208,10 +188,7 @@ def _slope(ratio: float, focal: float, center: float, size: int) -> tuple[float,
 
 
 @compiled()
-def _fill_rows(
-    axes: np.ndarray, x: float, y: float, z: float, k: np.ndarray, width: int, height: int,
-    rows: np.ndarray,
-) -> None:  # fmt: skip
+def _fill_rows(axes, x, y, z, k, width, height, rows):
     """The axes on the image plane, in px, by the projection's derivative at the mean."""
     slope_x, _ = _slope(x / z, k[0, 0], k[0, 2], width)
     slope_y, _ = _slope(y / z, k[1, 1], k[1, 2], height)
@@ -221,10 +198,7 @@ def _fill_rows(
 
 
 @compiled()
-def _rows_backward(
-    axes: np.ndarray, x: float, y: float, z: float, k: np.ndarray, width: int, height: int,
-    rows: np.ndarray, rows_grad: np.ndarray, axes_grad: np.ndarray, point_grad: np.ndarray,
-) -> None:  # fmt: skip
+def _rows_backward(axes, x, y, z, k, width, height, rows, rows_grad, axes_grad, point_grad):
     slope_x, free_x = _slope(x / z, k[0, 0], k[0, 2], width)
     slope_y, free_y = _slope(y / z, k[1, 1], k[1, 2], height)
     along_x, along_y, shrink = 0.0, 0.0, 0.0
@@ -241,7 +215,7 @@ def _rows_backward(
 
 
 @compiled()
-def _ellipse(rows: np.ndarray, low_pass: float) -> tuple[float, float, float, float]:
+def _ellipse(rows, low_pass):
     """Variances along x and y, slope of the centre line, variance along x within a row of pixels.
 
     The last is var_x − cov² / var_y, written as a sum of squares: nothing cancels.
@@ -260,9 +234,7 @@ def _ellipse(rows: np.ndarray, low_pass: float) -> tuple[float, float, float, fl
 
 
 @compiled()
-def _ellipse_backward(
-    rows: np.ndarray, low_pass: float, shape_grad: np.ndarray, rows_grad: np.ndarray
-) -> None:
+def _ellipse_backward(rows, low_pass, shape_grad, rows_grad):
     """By shape = (1 / rest, slope, 1 / var_y), `rest` as var_x − cov² / var_y."""
     _, var_y, slope, rest = _ellipse(rows, low_pass)
     rest_grad = -shape_grad[0] / (rest * rest)

@@ -30,14 +30,7 @@ _ZERO, _HALF = np.float32(0), np.float32(0.5)
 
 
 @compiled(parallel=True)
-def pack(
-    means: np.ndarray,
-    shapes: np.ndarray,
-    opacities: np.ndarray,
-    features: np.ndarray,
-    radii: np.ndarray,
-    packed: np.ndarray,
-) -> None:
+def pack(means, shapes, opacities, features, radii, packed):
     """What blending needs of an ellipse, side by side (n COLUMNS), padded with zero features."""
     for i in numba.prange(len(means)):
         packed[i] = 0
@@ -58,15 +51,8 @@ def pack(
 
 @compiled(parallel=True)
 def unpack(
-    slot_starts: np.ndarray,
-    moments: np.ndarray,
-    shapes: np.ndarray,
-    opacities: np.ndarray,
-    means_grad: np.ndarray,
-    shapes_grad: np.ndarray,
-    opacities_grad: np.ndarray,
-    features_grad: np.ndarray,
-) -> None:
+    slot_starts, moments, shapes, opacities, means_grad, shapes_grad, opacities_grad, features_grad
+):
     """Add each ellipse's slots, in order, and make gradients of the moments."""
     for i in numba.prange(len(shapes)):
         means_grad[i], shapes_grad[i], opacities_grad[i], features_grad[i] = 0, 0, 0, 0
@@ -130,9 +116,7 @@ def sort_into_tiles(
 
 
 @compiled(parallel=True)
-def _find_boxes(
-    means: np.ndarray, reaches: np.ndarray, columns: int, rows: int, boxes: np.ndarray
-) -> None:
+def _find_boxes(means, reaches, columns, rows, boxes):
     """First and one past the last tile, along x and y."""
     for i in numba.prange(len(means)):
         for axis in range(2):
@@ -144,7 +128,7 @@ def _find_boxes(
 
 
 @compiled()
-def _list_drawn(boxes: np.ndarray, slot_starts: np.ndarray, order: np.ndarray) -> int:
+def _list_drawn(boxes, slot_starts, order):
     """List those that touch a tile, and say how many; give each as many slots as tiles."""
     drawn = 0
     for i in range(len(boxes)):
@@ -157,7 +141,7 @@ def _list_drawn(boxes: np.ndarray, slot_starts: np.ndarray, order: np.ndarray) -
 
 
 @compiled()
-def _sort(keys: np.ndarray, order: np.ndarray) -> np.ndarray:
+def _sort(keys, order):
     """Stable radix sort of the indices in `order` by their keys."""
     target = np.empty_like(order)
     for digit in range(3):
@@ -176,7 +160,7 @@ def _sort(keys: np.ndarray, order: np.ndarray) -> np.ndarray:
 
 
 @compiled(parallel=True)
-def _count(order: np.ndarray, boxes: np.ndarray, columns: int, counts: np.ndarray) -> None:
+def _count(order, boxes, columns, counts):
     """How many ellipses of each part of the order touch each tile."""
     parts = len(counts)
     for part in numba.prange(parts):
@@ -187,7 +171,7 @@ def _count(order: np.ndarray, boxes: np.ndarray, columns: int, counts: np.ndarra
 
 
 @compiled()
-def _find_starts(counts: np.ndarray, starts: np.ndarray) -> None:
+def _find_starts(counts, starts):
     """Turn the counts into the place where each part starts to write in each tile."""
     total = 0
     for tile in range(counts.shape[1]):
@@ -198,15 +182,7 @@ def _find_starts(counts: np.ndarray, starts: np.ndarray) -> None:
 
 
 @compiled(parallel=True)
-def _fill(
-    order: np.ndarray,
-    boxes: np.ndarray,
-    slot_starts: np.ndarray,
-    columns: int,
-    places: np.ndarray,
-    gaussians: np.ndarray,
-    slots: np.ndarray,
-) -> None:
+def _fill(order, boxes, slot_starts, columns, places, gaussians, slots):
     parts = len(places)
     for part in numba.prange(parts):
         for i in order[len(order) * part // parts : len(order) * (part + 1) // parts]:

@@ -10,18 +10,7 @@ _TINY = np.float32(1e-20)
 
 
 @compiled(parallel=True)
-def trace_numba(
-    depths: np.ndarray,
-    origin: np.ndarray,
-    steps: np.ndarray,
-    start: np.ndarray,
-    stop: np.ndarray,
-    stretch: np.ndarray,
-    limit: np.ndarray,
-    rules: tuple[int, int, float],
-    entry: np.ndarray,
-    unobserved: np.ndarray,
-) -> None:
+def trace_numba(depths, origin, steps, start, stop, stretch, limit, rules, entry, unobserved):
     """Fill `entry` and `unobserved`; `rules` are the number of samples, that of bisections, and the
     tolerance. The other arguments are those of `visibility._Rays`, in single precision."""
     images, height, width = limit.shape
@@ -52,15 +41,7 @@ def trace_numba(
 
 
 @compiled()
-def _trace_ray(
-    depths: np.ndarray,
-    origin: np.ndarray,
-    along: np.ndarray,
-    start: np.float32,
-    stop: np.float32,
-    limit: np.float32,
-    rules: tuple[int, int, float],
-) -> tuple[np.float32, np.float32]:
+def _trace_ray(depths, origin, along, start, stop, limit, rules):
     """Where one ray first enters unobserved space, and over how much depth it stays there in front
     of `limit`."""
     samples, bisections, tolerance = rules
@@ -94,9 +75,7 @@ def _trace_ray(
 
 
 @compiled()
-def _find_empty(
-    depths: np.ndarray, origin: np.ndarray, along: np.ndarray, depth: float, margin: float
-) -> int:
+def _find_empty(depths, origin, along, depth, margin):
     """The first reference that has seen the ray's point to be empty; their number if none has."""
     for k in range(len(depths)):
         if _is_empty(depths, origin, along, k, depth, margin):
@@ -105,9 +84,7 @@ def _find_empty(
 
 
 @compiled()
-def _is_empty(
-    depths: np.ndarray, origin: np.ndarray, along: np.ndarray, k: int, depth: float, margin: float
-) -> bool:
+def _is_empty(depths, origin, along, k, depth, margin):
     """Whether reference `k` has seen the ray's point at a query depth to be empty."""
     height, width = np.float32(depths.shape[1]), np.float32(depths.shape[2])
     z = origin[k, 2] + depth * along[k, 2]

@@ -41,7 +41,7 @@ class Co3dFrames(Sequence[Frame]):
         """In the annotations' order, and why some are left out: their camera is degenerate."""
         cameras, sound = _convert_cameras(annotations)
         depths = [annotation.depth for annotation in annotations]
-        columns = {
+        columns: dict[str, np.ndarray] = {
             "number": np.array([annotation.number for annotation in annotations], np.int64),
             "size": np.array([annotation.size for annotation in annotations], np.int32),
             **cameras,

@@ -1,6 +1,5 @@
 """Gradient noise in space: the grain of every procedural texture."""
 
-from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float
@@ -13,8 +12,7 @@ _KEPT, _GONE = 0.25, 0.9
 
 
 @compiled()
-@no_type_check
-def _hash(x, y, z, seed):  # noqa: ANN001, ANN202
+def _hash(x, y, z, seed):
     """32 well-mixed bits of a lattice point."""
     h = (x * 0x8DA6B343 + y * 0xD8163841 + z * 0xCB1AB31F + seed * 0x9E3779B1) & 0xFFFFFFFF
     h = ((h ^ (h >> 15)) * 0x2C1B3C6D) & 0xFFFFFFFF
@@ -23,8 +21,7 @@ def _hash(x, y, z, seed):  # noqa: ANN001, ANN202
 
 
 @compiled()
-@no_type_check
-def _slope(h, x, y, z):  # noqa: ANN001, ANN202
+def _slope(h, x, y, z):
     """Dot product with one of Perlin's twelve edge gradients."""
     h = h & 15
     a = x if h < 8 else y
@@ -33,8 +30,7 @@ def _slope(h, x, y, z):  # noqa: ANN001, ANN202
 
 
 @compiled()
-@no_type_check
-def _perlin(x, y, z, seed):  # noqa: ANN001, ANN202
+def _perlin(x, y, z, seed):
     """Perlin's improved noise (2002), about −0.9 … 0.9."""
     i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
     x, y, z = x - i, y - j, z - k
@@ -50,8 +46,7 @@ def _perlin(x, y, z, seed):  # noqa: ANN001, ANN202
 
 
 @compiled()
-@no_type_check
-def _fractal(points, footprint, frequency, octaves, seed):  # noqa: ANN001, ANN202
+def _fractal(points, footprint, frequency, octaves, seed):
     out = np.empty(len(points), np.float32)
     for n in range(len(points)):
         total, amplitude, f = 0.0, 0.5, frequency

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import no_type_check
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
@@ -124,8 +123,7 @@ def _embree(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -
 
 
 @compiled()
-@no_type_check
-def _interpolate(attributes, faces, face, u, v):  # noqa: ANN001, ANN202
+def _interpolate(attributes, faces, face, u, v):
     out = np.empty((len(face), attributes.shape[1]), np.float32)
     for n in range(len(face)):
         a, b, c = faces[face[n], 0], faces[face[n], 1], faces[face[n], 2]

@@ -1,6 +1,5 @@
 """Arithmetic on many 3-vectors; unlike BLAS it gives the same bits for any number of threads."""
 
-from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float
@@ -11,8 +10,7 @@ Real = int | float
 
 
 @compiled()
-@no_type_check
-def _rotate(vectors, matrix):  # noqa: ANN001, ANN202
+def _rotate(vectors, matrix):
     out = np.empty_like(vectors)
     for n in range(len(vectors)):
         x, y, z = vectors[n, 0], vectors[n, 1], vectors[n, 2]
@@ -22,8 +20,7 @@ def _rotate(vectors, matrix):  # noqa: ANN001, ANN202
 
 
 @compiled()
-@no_type_check
-def _dot(a, b):  # noqa: ANN001, ANN202
+def _dot(a, b):
     out = np.empty(len(a), a.dtype)
     for n in range(len(a)):
         out[n] = a[n, 0] * b[n, 0] + a[n, 1] * b[n, 1] + a[n, 2] * b[n, 2]
@@ -31,8 +28,7 @@ def _dot(a, b):  # noqa: ANN001, ANN202
 
 
 @compiled()
-@no_type_check
-def _normalize(vectors):  # noqa: ANN001, ANN202
+def _normalize(vectors):
     out = np.empty_like(vectors)
     for n in range(len(vectors)):
         x, y, z = vectors[n, 0], vectors[n, 1], vectors[n, 2]

@@ -17,7 +17,7 @@ _ACROSS = occlusion.ACROSS
 
 
 @compiled()
-def project(m: np.ndarray, u: float, v: float, inverse: float) -> tuple[float, float, float]:
+def project(m, u, v, inverse):
     """`projection.project_pixels` of one pixel."""
     x = m[0, 0] * u + m[0, 1] * v + m[0, 2] + m[0, 3] * inverse
     y = m[1, 0] * u + m[1, 1] * v + m[1, 2] + m[1, 3] * inverse
@@ -27,13 +27,7 @@ def project(m: np.ndarray, u: float, v: float, inverse: float) -> tuple[float, f
 
 
 @compiled()
-def draw_occlusion(
-    inverse: np.ndarray,
-    links: np.ndarray,
-    intrinsics: np.ndarray,
-    m: np.ndarray,
-    unseen: np.ndarray,
-) -> None:
+def draw_occlusion(inverse, links, intrinsics, m, unseen):
     """Lower one reference's depth buffer `unseen` to the walls behind its occluding edges; links
     as in `_numba.surface`."""
     height, width = inverse.shape
@@ -56,7 +50,7 @@ def draw_occlusion(
 
 
 @compiled()
-def _run(links: np.ndarray, y: int, x: int, dy: int, dx: int, side: int) -> int:
+def _run(links, y, x, dy, dx, side):
     """Pixels connected in a row from (y, x) towards `side`, itself included."""
     count = 1
     while links[y, x] >> side & 1:
@@ -65,9 +59,7 @@ def _run(links: np.ndarray, y: int, x: int, dy: int, dx: int, side: int) -> int:
 
 
 @compiled()
-def _draw_wall(
-    m: np.ndarray, u: float, v: float, start: float, stop: float, upright: bool, unseen: np.ndarray
-) -> None:
+def _draw_wall(m, u, v, start, stop, upright, unseen):
     height, width = unseen.shape
     x0, y0, _ = project(m, u, v, start)
     x1, y1, _ = project(m, u, v, stop)

@@ -100,18 +100,8 @@ def move_points_numba(
 
 @compiled(parallel=True)
 def _cut(
-    depth: np.ndarray,
-    intrinsics: np.ndarray,
-    centers: np.ndarray,
-    matrix: np.ndarray,
-    inverse: np.ndarray,
-    slopes: np.ndarray,
-    links: np.ndarray,
-    counts: np.ndarray,
-    reaches: np.ndarray,
-    unseen: np.ndarray,
-    sizes: np.ndarray,
-) -> None:
+    depth, intrinsics, centers, matrix, inverse, slopes, links, counts, reaches, unseen, sizes
+):
     """Every reference's surface, its walls, and into how many points each pixel and each block of
     rows is cut."""
     for r in numba.prange(len(depth)):
@@ -123,14 +113,7 @@ def _cut(
 
 
 @compiled()
-def _cut_pixels(
-    surface: tuple[np.ndarray, ...],
-    camera: tuple[np.ndarray, ...],
-    query_size: tuple[int, int],
-    counts: np.ndarray,
-    reaches: np.ndarray,
-    sizes: np.ndarray,
-) -> None:
+def _cut_pixels(surface, camera, query_size, counts, reaches, sizes):
     """Points and reach of each pixel; none where the query sees its back, or not even its rim."""
     inverse, slopes, valid = surface
     intrinsics, center, m = camera
@@ -146,9 +129,7 @@ def _cut_pixels(
 
 
 @compiled()
-def _may_be_seen(
-    m: np.ndarray, inverse: np.ndarray, slopes: np.ndarray, y: int, x: int, size: tuple[int, int]
-) -> bool:
+def _may_be_seen(m, inverse, slopes, y, x, size):
     """Whether any of a pixel's surface may lie in the query's image, or within `_RIM` of it.
 
     Close to the query a pixel is cut into many points, most of which lie outside the image: this
@@ -168,16 +149,7 @@ def _may_be_seen(
 
 
 @compiled()
-def _greatest(
-    m: np.ndarray,
-    inverse: np.ndarray,
-    slopes: np.ndarray,
-    y: int,
-    x: int,
-    a: float,
-    b: float,
-    c: float,
-) -> float:
+def _greatest(m, inverse, slopes, y, x, a, b, c):
     """Of `a·X + b·Y + c·ratio` over a pixel, (X, Y) / ratio being its place in the query."""
     along_u = a * m[0, 0] + b * m[1, 0] + c * m[2, 0]
     along_v = a * m[0, 1] + b * m[1, 1] + c * m[2, 1]
@@ -193,9 +165,7 @@ def _greatest(
 
 
 @compiled()
-def _faces(
-    inverse: np.ndarray, slopes: np.ndarray, k: np.ndarray, center: np.ndarray, y: int, x: int
-) -> bool:
+def _faces(inverse, slopes, k, center, y, x):
     """Whether the query's centre lies on the reference's side of the tangent plane
     (`surface.plane_vectors`)."""
     away_x = (slopes[0, y, x] + slopes[1, y, x]) / _TWO * k[0, 0]
@@ -207,9 +177,7 @@ def _faces(
 
 
 @compiled()
-def _divide(
-    m: np.ndarray, inverse: np.ndarray, slopes: np.ndarray, y: int, x: int
-) -> tuple[int, int, float, float]:
+def _divide(m, inverse, slopes, y, x):
     """Points of a pixel along u and v, and the reach in the query of each."""
     u, v, ratio = project(m, np.float32(x) + _HALF, np.float32(y) + _HALF, inverse[y, x])
     u_u, u_v = _step(m, u, v, ratio, 0, (slopes[0, y, x] + slopes[1, y, x]) / _TWO)
@@ -222,9 +190,7 @@ def _divide(
 
 
 @compiled()
-def _step(
-    m: np.ndarray, u: float, v: float, ratio: float, axis: int, slope: float
-) -> tuple[float, float]:
+def _step(m, u, v, ratio, axis, slope):
     """Movement in the query, along its u and v, for one reference pixel along an axis."""
     z = m[2, axis] + slope * m[2, 3]
     across = (m[0, axis] + slope * m[0, 3] - u * z) / max(ratio, _LEAST_RATIO)
@@ -233,28 +199,28 @@ def _step(
 
 
 @compiled()
-def _points_along(across: float, down: float) -> int:
+def _points_along(across, down):
     length = np.float32(math.sqrt(across * across + down * down)) / _LARGEST_SPACING
     return max(math.ceil(min(length, np.float32(_MOST_POINTS))), 1)
 
 
 @compiled(parallel=True)
 def _fill(
-    inverse: np.ndarray,
-    slopes: np.ndarray,
-    links: np.ndarray,
-    counts: np.ndarray,
-    reaches: np.ndarray,
-    matrix: np.ndarray,
-    colours: np.ndarray,
-    grid: np.ndarray,
-    k: int,
-    unseen: np.ndarray,
-    spans: np.ndarray,
-    points: np.ndarray,
-    reach: np.ndarray,
-    values: np.ndarray,
-) -> None:
+    inverse,
+    slopes,
+    links,
+    counts,
+    reaches,
+    matrix,
+    colours,
+    grid,
+    k,
+    unseen,
+    spans,
+    points,
+    reach,
+    values,
+):
     """Points, their reach and values, and where the span of each block ends: at most where the
     next begins."""
     height, blocks = inverse.shape[1], len(spans) // len(inverse)
@@ -269,17 +235,7 @@ def _fill(
 
 
 @compiled()
-def _fill_row(
-    surface: tuple[np.ndarray, ...],
-    m: np.ndarray,
-    maps: tuple[np.ndarray, np.ndarray, float],
-    unseen: np.ndarray,
-    y: int,
-    n: int,
-    points: np.ndarray,
-    reach: np.ndarray,
-    values: np.ndarray,
-) -> int:
+def _fill_row(surface, m, maps, unseen, y, n, points, reach, values):
     """Write the row's points that the query sees from place `n` on, and say where they end."""
     inverse, slopes, links, counts, reaches = surface
     for x in range(inverse.shape[1]):
@@ -306,13 +262,7 @@ def _fill_row(
 
 
 @compiled()
-def _blend(
-    maps: tuple[np.ndarray, np.ndarray, float],
-    pixels: tuple[int, int, int, int],
-    share_u: float,
-    share_v: float,
-    values: np.ndarray,
-) -> None:
+def _blend(maps, pixels, share_u, share_v, values):
     """Colour and coordinates between a pixel (y, x) and its neighbours (y, x2) and (y2, x)."""
     colours, grid, nearest = maps
     y, x, y2, x2 = pixels
@@ -326,7 +276,7 @@ def _blend(
 
 
 @compiled()
-def _is_seen(u: float, v: float, ratio: float, inverse: float, unseen: np.ndarray) -> bool:
+def _is_seen(u, v, ratio, inverse, unseen):
     """Whether a point lies in the image, before the query, and not behind what the reference
     never saw."""
     height, width = unseen.shape

@@ -55,14 +55,7 @@ def splat_numba(
 
 
 @compiled(parallel=True)
-def _splat(
-    points: np.ndarray,
-    reach: np.ndarray,
-    values: np.ndarray,
-    spans: np.ndarray,
-    bands: int,
-    means: np.ndarray,
-) -> None:
+def _splat(points, reach, values, spans, bands, means):
     height = means.shape[2]
     for task in numba.prange(len(spans) * bands):
         image, band = task // bands, task % bands
@@ -71,14 +64,7 @@ def _splat(
 
 
 @compiled()
-def _draw_band(
-    points: np.ndarray,
-    reach: np.ndarray,
-    values: np.ndarray,
-    spans: np.ndarray,
-    rows: tuple[int, int],
-    means: np.ndarray,
-) -> None:
+def _draw_band(points, reach, values, spans, rows, means):
     channels, _, width = means.shape
     frame = (rows[0], rows[1], width)
     pixels = (rows[1] - rows[0] + 2) * (width + 2)
@@ -90,13 +76,7 @@ def _draw_band(
 
 
 @compiled()
-def _find_nearest(
-    points: np.ndarray,
-    reach: np.ndarray,
-    spans: np.ndarray,
-    frame: tuple[int, int, int],
-    nearest: np.ndarray,
-) -> None:
+def _find_nearest(points, reach, spans, frame, nearest):
     """Least depth of the points that reach each pixel's centre."""
     u, v, depth = points
     row, each = frame[2] + 2, reach.shape[1] > 1
@@ -117,14 +97,7 @@ def _find_nearest(
 
 
 @compiled(contract=True)
-def _add(
-    points: np.ndarray,
-    values: np.ndarray,
-    spans: np.ndarray,
-    frame: tuple[int, int, int],
-    nearest: np.ndarray,
-    summed: np.ndarray,
-) -> None:
+def _add(points, values, spans, frame, nearest, summed):
     """Add the points' values to the pixels around them, by kernel and depth, block by block."""
     row, channels = frame[2] + 2, values.shape[1]
     pixels = np.zeros(_BLOCK, np.uint32)
@@ -155,15 +128,7 @@ def _add(
 
 
 @compiled(contract=True)
-def _weigh(
-    pixels: np.ndarray,
-    right: np.ndarray,
-    down: np.ndarray,
-    depth: np.ndarray,
-    row: int,
-    nearest: np.ndarray,
-    weights: np.ndarray,
-) -> None:
+def _weigh(pixels, right, down, depth, row, nearest, weights):
     """Weights of a block of points in the four pixels around each.
 
     Always of a whole block, so that always the same vector instructions round in the same way;
@@ -194,14 +159,7 @@ def _weigh(
 
 
 @compiled(contract=True)
-def _add_block(
-    pixels: np.ndarray,
-    weights: np.ndarray,
-    lanes: np.ndarray,
-    filled: int,
-    row: int,
-    summed: np.ndarray,
-) -> None:
+def _add_block(pixels, weights, lanes, filled, row, summed):
     for i in range(filled):
         for corner in range(4):
             weight = weights[corner, i]
@@ -214,7 +172,7 @@ def _add_block(
 
 
 @compiled()
-def _write_means(summed: np.ndarray, frame: tuple[int, int, int], means: np.ndarray) -> None:
+def _write_means(summed, frame, means):
     """Divide by the weight, and leave the margin behind."""
     channels = len(means)
     top, bottom, width = frame
@@ -229,7 +187,7 @@ def _write_means(summed: np.ndarray, frame: tuple[int, int, int], means: np.ndar
 
 
 @compiled()
-def _touches(u: float, v: float, frame: tuple[int, int, int]) -> bool:
+def _touches(u, v, frame):
     """Whether a point lies within a pixel of the rows and columns; false for NaN, too."""
     top, bottom, width = frame
     in_rows = np.float32(top) - _HALF <= v < np.float32(bottom) + _HALF
@@ -237,9 +195,7 @@ def _touches(u: float, v: float, frame: tuple[int, int, int]) -> bool:
 
 
 @compiled()
-def _place(
-    u: float, v: float, frame: tuple[int, int, int]
-) -> tuple[np.uint32, np.floating, np.floating]:
+def _place(u, v, frame):
     """The frame's pixel whose centre lies up left of a point, and how far the point is from it."""
     top, _, width = frame
     left, above = np.float32(math.floor(u - _HALF)), np.float32(math.floor(v - _HALF))
@@ -261,7 +217,7 @@ def project_numba(
 
 
 @compiled(parallel=True)
-def _project(world: np.ndarray, m: np.ndarray, points: np.ndarray) -> None:
+def _project(world, m, points):
     for i in numba.prange(len(world)):
         x, y, z = world[i, 0], world[i, 1], world[i, 2]
         depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]

@@ -20,13 +20,7 @@ _UNKNOWN, _LINKED, _RISES, _FALLS = 0, 1, 2, 3
 
 
 @compiled()
-def find_surface(
-    depth: np.ndarray,
-    intrinsics: np.ndarray,
-    inverse_depth: np.ndarray,
-    side_slopes: np.ndarray,
-    side_links: np.ndarray,
-) -> np.ndarray:
+def find_surface(depth, intrinsics, inverse_depth, side_slopes, side_links):
     """Fill in one reference's inverse depth (h w), slopes (4 h w) and links (h w); the pixels that
     lie on a surface (h w)."""
     height, width = depth.shape
@@ -57,9 +51,7 @@ def find_surface(
 
 
 @compiled()
-def _sort_steps(
-    inverse: np.ndarray, line: tuple[int, int, int], focal: float, kinds: np.ndarray
-) -> None:
+def _sort_steps(inverse, line, focal, kinds):
     """Kind of the step before each pixel of a line (its first pixel, stride, length); the ends of
     the line are unknown."""
     start, stride, length = line
@@ -82,7 +74,7 @@ def _sort_steps(
 
 
 @compiled()
-def _is_straight(inverse: np.ndarray, line: tuple[int, int, int], i: int) -> bool:
+def _is_straight(inverse, line, i):
     """Whether the step before pixel `i` is one of three in a row with similar slopes."""
     run = 0
     for j in range(i - 2, i + 2):
@@ -93,7 +85,7 @@ def _is_straight(inverse: np.ndarray, line: tuple[int, int, int], i: int) -> boo
 
 
 @compiled()
-def _bends_little(inverse: np.ndarray, line: tuple[int, int, int], i: int) -> bool:
+def _bends_little(inverse, line, i):
     start, stride, length = line
     if i < 1 or i >= length - 1:
         return False
@@ -108,15 +100,7 @@ def _bends_little(inverse: np.ndarray, line: tuple[int, int, int], i: int) -> bo
 
 
 @compiled()
-def _connect(
-    inverse: np.ndarray,
-    line: tuple[int, int, int],
-    kinds: np.ndarray,
-    side: int,
-    slopes: np.ndarray,
-    links: np.ndarray,
-    valid: np.ndarray,
-) -> None:
+def _connect(inverse, line, kinds, side, slopes, links, valid):
     """Slopes and links of a line's pixels to the previous one, on `side`, and the next, on the
     side after that."""
     start, stride, length = line
@@ -145,7 +129,7 @@ def _connect(
 
 
 @compiled()
-def _extend_slope(slope: float, inner: float) -> float:
+def _extend_slope(slope, inner):
     """The slope beyond the end of a surface: changing on as it did just inside, at most
     twofold."""
     grown = slope - inner
