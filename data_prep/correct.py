@@ -15,11 +15,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
+from extrap_train.depth import require_depth
 from extrap_train.geometry.epipolar import steps_across
 from extrap_train.geometry.spline_flow import fit_flow, flow_at, least_squares_flow
 from extrap_train.geometry.warp import warp_references
 from extrap_train.matching import Matcher
-from extrap_train.views import Camera, Warp, stack_cameras
+from extrap_train.views import Camera, View, Warp, stack_cameras
 
 METHOD = 3
 """Raised whenever the same frames give other corrections, so that old ones are made anew."""
@@ -57,63 +58,49 @@ class Correction:
     """Why the warp stays as it is."""
 
 
-def correct_pair(
-    image: Float[Tensor, "3 h w"],
-    depth: Float[Tensor, "h w"],
-    reference: Camera,
-    truth: Float[Tensor, "3 h w"],
-    query: Camera,
-    matcher: Matcher,
-    grid: int,
-) -> Correction:
+def correct_pair(reference: View, query: View, matcher: Matcher, grid: int) -> Correction:
     """The flow that brings a reference's warp to where the true query image shows the same.
 
     `grid` is the number of control points along each side of the flow.
     """
-    before = draw(image, depth, reference, query)
-    error_before = photometric_error(before, truth)
-    matches = matcher.match(before.image[0], truth, before.mask[0] > 0)
+    camera, before = query.camera, draw(reference, query.camera)
+    error = photometric_error(before, query.image)
+    matches = matcher.match(before.image[0], query.image, before.mask[0] > 0)
     if len(matches) < LEAST_MATCHES:
-        return Correction(None, error_before, error_before, f"only {len(matches)} matches")
+        return Correction(None, error, error, f"only {len(matches)} matches")
     chosen = torch.linspace(0, len(matches) - 1, min(len(matches), MOST_MATCHES)).long()
     matches = matches[chosen]
-    across = float(steps_across(matches.first, matches.first_to_second, reference, query).median())
-    if across > LARGEST_ACROSS * max(query.width, query.height):
+    steps = matches.first_to_second
+    across = float(steps_across(matches.first, steps, reference.camera, camera).median())
+    if across > LARGEST_ACROSS * max(camera.width, camera.height):
         reason = f"the matches lie {across:.1f} px off their epipolar lines"
-        return Correction(None, error_before, error_before, reason)
-    size = torch.tensor([query.width, query.height])
-    positions, steps = matches.first / size * 2 - 1, matches.first_to_second / size * 2
+        return Correction(None, error, error, reason)
+    size = torch.tensor([camera.width, camera.height])
+    positions, steps = matches.first / size * 2 - 1, steps / size * 2
     flow, inliers = fit_flow(positions, steps, matches.confidence, grid)
     share = float(inliers.float().mean())
     if share < LEAST_INLIERS:
-        reason = f"{share:.0%} of the matches move together"
-        return Correction(None, error_before, error_before, reason)
+        return Correction(None, error, error, f"{share:.0%} of the matches move together")
     positions, steps, weights = positions[inliers], steps[inliers], matches.confidence[inliers]
     if not _explains(flow, positions, steps):
-        return Correction(None, error_before, error_before, "the matches have no motion in common")
+        return Correction(None, error, error, "the matches have no motion in common")
     if float((steps * size / 2).norm(dim=1).median()) < LEAST_STEP:
-        return Correction(None, error_before, error_before, "the matches hardly move")
+        return Correction(None, error, error, "the matches hardly move")
     flows = [flow, *(least_squares_flow(positions, steps, weights, grid, s) for s in STIFFER)]
-    tried = [_try_flow(before, image, depth, reference, truth, query, flow) for flow in flows]
+    tried = [_try_flow(before, reference, query, flow) for flow in flows]
     best = max(tried, key=_gain)
     if not _gain(best) >= LEAST_GAIN:
-        return Correction(None, error_before, error_before, "the picture comes no closer")
+        return Correction(None, error, error, "the picture comes no closer")
     return best
 
 
 def _try_flow(
-    before: Warp,
-    image: Float[Tensor, "3 h w"],
-    depth: Float[Tensor, "h w"],
-    reference: Camera,
-    truth: Float[Tensor, "3 h w"],
-    query: Camera,
-    flow: Float[Tensor, "2 g g"],
+    before: Warp, reference: View, query: View, flow: Float[Tensor, "2 g g"]
 ) -> Correction:
     # As it is stored, so that what is judged is what training draws.
     flow = flow.half().float()
-    after = draw(image, depth, reference, query, flow)
-    return Correction(flow, *errors_in_common(before, after, truth))
+    after = draw(reference, query.camera, flow)
+    return Correction(flow, *errors_in_common(before, after, query.image))
 
 
 def _gain(correction: Correction) -> float:
@@ -122,18 +109,12 @@ def _gain(correction: Correction) -> float:
     return gain if math.isfinite(gain) else -1.0
 
 
-def draw(
-    image: Float[Tensor, "3 h w"],
-    depth: Float[Tensor, "h w"],
-    reference: Camera,
-    query: Camera,
-    flow: Float[Tensor, "2 g g"] | None = None,
-) -> Warp:
+def draw(reference: View, query: Camera, flow: Float[Tensor, "2 g g"] | None = None) -> Warp:
     """The warp of one reference, its points moved by `flow`."""
     return warp_references(
-        image[None, None],
-        depth[None, None],
-        stack_cameras([stack_cameras([reference])]),
+        reference.image[None, None],
+        require_depth(reference)[None, None],
+        stack_cameras([stack_cameras([reference.camera])]),
         torch.ones(1, 1, dtype=torch.bool),
         stack_cameras([query]),
         None if flow is None else flow[None, None],

@@ -217,15 +217,7 @@ def correct_pairs(
         if matcher is None or split != "train":
             rows.append((-1, np.nan, np.nan, ""))
             continue
-        found = correct_pair(
-            frames.image(reference),
-            frames.depth(reference),
-            frames.camera[reference],
-            frames.image(query),
-            frames.camera[query],
-            matcher,
-            grid,
-        )
+        found = correct_pair(frames.view(reference), frames.view(query), matcher, grid)
         number = -1 if found.flow is None else len(flows)
         if found.flow is not None:
             flows.append(found.flow.numpy())

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from extrap_train.data.paths import file_stamp
 from extrap_train.store.atomic import atomic_folder, save_array
-from extrap_train.views import Camera
+from extrap_train.views import Camera, View
 
 FLOWS = "flows.npy"
 """Of the pairs of one sequence, beside their table: control vectors (`geometry.spline_flow`)."""
@@ -62,15 +62,14 @@ class StoredFrames:
         scale = float(table["depth_scale"][0].as_py())
         return cls(folder, camera, table["depth_share"].to_numpy(), scale)
 
-    def image(self, index: int) -> Float[Tensor, "3 h w"]:
-        """Colours in [0, 1]."""
-        pixels = np.load(self.folder / IMAGES, mmap_mode="r")[index]
-        return torch.from_numpy(np.array(pixels)).permute(2, 0, 1).contiguous().float().div_(255)
-
-    def depth(self, index: int) -> Float[Tensor, "h w"]:
-        """In scene units; 0 is unknown."""
-        stored = np.load(self.folder / DEPTHS, mmap_mode="r")[index]
-        return torch.from_numpy(np.array(stored)).float().mul_(self.depth_scale)
+    def view(self, index: int) -> View:
+        """A frame with its depth in scene units; 0 is unknown."""
+        pixels, depth = (
+            torch.from_numpy(np.array(np.load(self.folder / name, mmap_mode="r")[index])).float()
+            for name in (IMAGES, DEPTHS)
+        )
+        image = pixels.permute(2, 0, 1).contiguous().div_(255)
+        return View(image, self.camera[index], depth.mul_(self.depth_scale))
 
 
 def sequence_folder(root: Path, kind: str, sequence: str) -> Path:

@@ -14,7 +14,7 @@ from extrap_train.geometry.cameras import project, unproject_to_world
 from extrap_train.geometry.warp import warp_references
 from extrap_train.matching import Matches
 from extrap_train.matching.dense_flow import FlowMatcher
-from extrap_train.views import Camera, Warp, stack_cameras
+from extrap_train.views import Camera, View, Warp, stack_cameras
 
 SIZE, GRID = 128, 12
 FLOW = FlowMatcher(FlowMatcherConfig())
@@ -74,7 +74,7 @@ def test_misalignment_falls_and_never_rises(scene: Scene) -> None:
         reference, query = (orbit_camera(azimuth, size=SIZE) for azimuth in (first, second))
         image, truth = speckled(scene, reference), speckled(scene, query)
         depth = scene.depth(reference) * smooth_error(seed)
-        found = correct_pair(image, depth, reference, truth, query, FLOW, GRID)
+        found = correct_pair(View(image, reference, depth), View(truth, query), FLOW, GRID)
         for values, flow in ((before, None), (after, found.flow)):
             warp = drawn(image, depth, reference, query, flow)
             values.append(misalignment(warp, scene, reference, query))
@@ -96,7 +96,7 @@ def test_no_pair_gets_worse_however_small_or_noisy_the_error(
         image, truth = speckled(scene, reference), speckled(scene, query)
         factors = smooth_error(seed, amount, noise) if noise else torch.ones(SIZE, SIZE)
         depth = scene.depth(reference) * factors
-        found = correct_pair(image, depth, reference, truth, query, FLOW, GRID)
+        found = correct_pair(View(image, reference, depth), View(truth, query), FLOW, GRID)
         if found.flow is None:
             continue
         moved += 1
@@ -113,7 +113,7 @@ def test_exact_depth_is_left_alone_or_hardly_moved() -> None:
     reference, query = orbit_camera(0, size=SIZE), orbit_camera(20, size=SIZE)
     image, truth = (speckled(SPHERE_ON_PLANE, camera) for camera in (reference, query))
     depth = SPHERE_ON_PLANE.depth(reference)
-    found = correct_pair(image, depth, reference, truth, query, FLOW, GRID)
+    found = correct_pair(View(image, reference, depth), View(truth, query), FLOW, GRID)
     warps = [drawn(image, depth, reference, query, flow) for flow in (None, found.flow)]
     before, after = (misalignment(warp, SPHERE_ON_PLANE, reference, query) for warp in warps)
     assert after < max(before, 0.1)
@@ -145,7 +145,9 @@ def test_useless_matches_leave_the_warp_alone(count: int, step, reason: str) -> 
     image, truth = (speckled(SPHERE_ON_PLANE, camera) for camera in (reference, query))
     first = torch.rand(count, 2, generator=torch.Generator().manual_seed(1)) * SIZE
     depth = SPHERE_ON_PLANE.depth(reference)
-    found = correct_pair(image, depth, reference, truth, query, Fixed(first, step), GRID)
+    found = correct_pair(
+        View(image, reference, depth), View(truth, query), Fixed(first, step), GRID
+    )
     assert found.flow is None
     assert reason in found.reason
     assert found.error_after == found.error_before
@@ -170,7 +172,7 @@ def test_a_wrong_truth_corrects_nothing(
         reference, query = (orbit_camera(azimuth, size=SIZE) for azimuth in (first, second))
         image, truth = speckled(scene, reference), wrong(speckled(scene, query))
         depth = scene.depth(reference) * smooth_error(seed)
-        found = correct_pair(image, depth, reference, truth, query, FLOW, GRID)
+        found = correct_pair(View(image, reference, depth), View(truth, query), FLOW, GRID)
         assert "off their epipolar lines" in found.reason
         assert found.flow is None
 

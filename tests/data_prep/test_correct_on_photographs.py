@@ -17,6 +17,7 @@ from data_prep.correct import Correction, correct_pair
 from extrap_train.config import Co3dConfig, FlowMatcherConfig, PrepConfig, StereoConfig
 from extrap_train.data.prepared import PreparedData
 from extrap_train.matching.matchers import matcher
+from extrap_train.views import View
 
 GATES = (0.0, 0.01, 0.02, 0.05)
 Picture = torch.Tensor
@@ -64,11 +65,8 @@ def corrections(
         cameras = data.cameras(pair.sequence)
         found.append(
             correct_pair(
-                images[0],
-                depths[0],
-                cameras[reference],
-                truth(images[1]),
-                cameras[query],
+                View(images[0], cameras[reference], depths[0]),
+                View(truth(images[1]), cameras[query]),
                 method,
                 PrepConfig().correction_grid,
             )

@@ -1,6 +1,5 @@
 """Gradient noise in space: the grain of every procedural texture."""
 
-
 import numpy as np
 from jaxtyping import Float
 

@@ -1,6 +1,5 @@
 """Arithmetic on many 3-vectors; unlike BLAS it gives the same bits for any number of threads."""
 
-
 import numpy as np
 from jaxtyping import Float
 
