@@ -34,14 +34,12 @@ def read_record(path: Path, kind: type[T], remedy: str) -> T:
     """
     try:
         if path.stat().st_size > MAX_RECORD_BYTES:
-            raise InputError(f"{path}: is larger than any {kind.__name__} record; {remedy}")
+            raise InputError(f"{path}: damaged (larger than such a file can be); {remedy}")
         return TypeAdapter(kind).validate_json(path.read_bytes(), strict=True)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         entry = ".".join(map(str, first["loc"])) or "the file"
-        raise InputError(
-            f"{path}: is no {kind.__name__} record ({entry}: {first['msg']}); {remedy}"
-        ) from None
+        raise InputError(f"{path}: damaged ({entry}: {first['msg']}); {remedy}") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
 

@@ -189,7 +189,7 @@ def test_a_protocol_without_results_gives_way(own: Path, tmp_path: Path) -> None
 
 def test_a_plan_that_is_none_is_one_line(copy: Path) -> None:
     greys_folder(copy).plan.write_text("{}")
-    with pytest.raises(InputError, match=r"plan.json: is no Plan record"):
+    with pytest.raises(InputError, match=r"plan.json: damaged"):
         read_results(greys_folder(copy))
 
 
