@@ -37,7 +37,7 @@ def _held_out(output: Path) -> tuple[PairBatch, Bool[Tensor, "b 1 h w"], Bool[Te
     )
     reader, pairs = ExampleReader([prepared], "test", _REFERENCES), prepared.pairs("test")
     chosen = linspace_indices(len(reader), _VIEWS)
-    batch = compute_warp(ValidationBatches(reader, chosen, _VIEWS, _REFERENCES)[0], _SIZE)
+    batch = compute_warp(ValidationBatches(reader, chosen, _VIEWS)[0], _SIZE)
     truths = [prepared.frames(pairs[i].sequence, [pairs[i].query]) for i in chosen]
     depth = functional.avg_pool2d(torch.stack([depth for _, depth, _ in truths]), 2)
     mask = functional.avg_pool2d(torch.stack([mask for _, _, mask in truths]), 2) > 0.5

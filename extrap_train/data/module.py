@@ -7,6 +7,7 @@ import lightning
 import numpy as np
 from torch.utils.data import DataLoader, Dataset, Sampler
 
+from extrap_train.config import TrainConfig
 from extrap_train.data.examples import Example, ExampleReader, linspace_indices, mirror
 from extrap_train.geometry.reduction import reduce_batch
 from extrap_train.geometry.warp import warp_references
@@ -83,16 +84,16 @@ class PositionSampler(Sampler[Positions]):
 
 
 class TrainingBatches(Dataset[PairBatch]):
-    """Whole batches by their positions: one to `references` photographs, half mirrored."""
+    """Whole batches by their positions: one to all of the reader's references, half mirrored."""
 
-    def __init__(self, reader: ExampleReader, references: int, seed: int) -> None:
-        self.reader, self.references, self.seed = reader, references, seed
+    def __init__(self, reader: ExampleReader, seed: int) -> None:
+        self.reader, self.seed = reader, seed
 
     def __getitem__(self, positions: Positions) -> PairBatch:
         examples: list[Example] = []
         for position, pair in positions:
             rng = np.random.default_rng((self.seed, position))
-            count = int(rng.integers(1, self.references + 1))
+            count = int(rng.integers(1, self.reader.references + 1))
             example = self.reader.read(pair, count, rng)
             examples.append(mirror(example) if rng.random() < 0.5 else example)
         return self.reader.collate(examples)
@@ -101,21 +102,17 @@ class TrainingBatches(Dataset[PairBatch]):
 class ValidationBatches(Dataset[PairBatch]):
     """The same examples, with all their references, every time."""
 
-    def __init__(
-        self, reader: ExampleReader, chosen: list[int], size: int, references: int
-    ) -> None:
-        self.reader, self.references = reader, references
+    def __init__(self, reader: ExampleReader, chosen: list[int], size: int) -> None:
+        self.reader = reader
         self.batches = [chosen[i : i + size] for i in range(0, len(chosen), size)]
 
     def __len__(self) -> int:
         return len(self.batches)
 
     def __getitem__(self, index: int) -> PairBatch:
+        read, count = self.reader.read, self.reader.references
         return self.reader.collate(
-            [
-                self.reader.read(pair, self.references, np.random.default_rng(pair))
-                for pair in self.batches[index]
-            ]
+            [read(pair, count, np.random.default_rng(pair)) for pair in self.batches[index]]
         )
 
 
@@ -123,28 +120,18 @@ class PairModule(lightning.LightningDataModule):
     """Training and validation batches; the warp is made after the batch has reached its device."""
 
     def __init__(
-        self,
-        train: ExampleReader,
-        validation: ExampleReader,
-        *,
-        image_size: int,
-        batch_size: int,
-        batches_per_epoch: int,
-        validation_examples: int,
-        validation_batch_size: int,
-        references: int,
-        workers: int,
-        seed: int,
+        self, train: ExampleReader, validation: ExampleReader, config: TrainConfig
     ) -> None:
         super().__init__()
-        self.train, self.validation = train, validation
-        self.image_size = image_size
-        self.batch_size = batch_size
-        self.batches_per_epoch = batches_per_epoch
-        self.validation_batch_size = validation_batch_size
-        self.references = references
-        self.workers, self.seed = workers, seed
-        self.chosen = linspace_indices(len(validation), validation_examples)
+        self.train, self.validation, self.config = train, validation, config
+        chosen = linspace_indices(len(validation), config.validation.examples)
+        self.held_out = ValidationBatches(validation, chosen, config.validation.batch_size)
+        """Spread evenly over the test pairs."""
+
+    @property
+    def batches_per_epoch(self) -> int:
+        """Steps from one checkpoint to the next."""
+        return min(self.config.trainer.checkpoint_every, self.config.trainer.steps)
 
     def train_dataloader(self) -> DataLoader[PairBatch]:
         """The batches up to the next checkpoint, at a multiple of `batches_per_epoch` steps."""
@@ -152,39 +139,40 @@ class PairModule(lightning.LightningDataModule):
         done = trainer.global_step if trainer else 0
         sampler = PositionSampler(
             len(self.train),
-            self.batch_size,
+            self.config.trainer.batch_size,
             self.batches_per_epoch - done % self.batches_per_epoch,
-            self.seed,
+            self.config.seed,
             steps_done=lambda: trainer.global_step if trainer else 0,
             rank=trainer.global_rank if trainer else 0,
             world=trainer.world_size if trainer else 1,
         )
-        dataset = TrainingBatches(self.train, self.references, self.seed)
-        return self._loader(dataset, sampler)
+        return self._loader(TrainingBatches(self.train, self.config.seed), sampler)
 
     def val_dataloader(self) -> DataLoader[PairBatch]:
-        """Held-out examples, spread evenly over the test pairs; processes take turns at them."""
-        dataset = ValidationBatches(
-            self.validation, self.chosen, self.validation_batch_size, self.references
-        )
+        """Held-out examples; processes take turns at them."""
         trainer = self.trainer
         rank, world = (trainer.global_rank, trainer.world_size) if trainer else (0, 1)
-        return self._loader(dataset, shard(len(dataset.batches), rank, world))
+        return self._loader(self.held_out, shard(len(self.held_out), rank, world))
+
+    def validation_names(self) -> list[list[str]]:
+        """What the held-out views of each validation batch are called."""
+        return [[self.validation.name(i) for i in batch] for batch in self.held_out.batches]
 
     def _loader(
         self, dataset: Dataset[PairBatch], sampler: Sampler[Positions] | list[int]
     ) -> DataLoader[PairBatch]:
+        workers = self.config.trainer.workers
         return DataLoader(
             dataset,
             batch_size=None,
             sampler=sampler,
-            num_workers=self.workers,
-            persistent_workers=self.workers > 0,
+            num_workers=workers,
+            persistent_workers=workers > 0,
         )
 
     def on_after_batch_transfer(self, batch: PairBatch, dataloader_idx: int) -> PairBatch:
         """Lightning's hook: warps are computed, not stored."""
-        return compute_warp(batch, self.image_size)
+        return compute_warp(batch, self.config.model.image_size)
 
 
 def shard(batches: int, rank: int, world: int) -> list[int]:

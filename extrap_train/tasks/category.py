@@ -52,7 +52,7 @@ from extrap_train.store.cache import REMEDY, Conflict, claim
 from extrap_train.store.manifest import Manifest
 from extrap_train.tasks.leakage import require_unseen
 from extrap_train.tasks.results import Results, draw_curve, draw_views, write_results
-from extrap_train.tasks.training_data import Prepare, data_module, validation_names
+from extrap_train.tasks.training_data import Prepare, data_module
 from extrap_train.terminal import terminal
 
 
@@ -80,7 +80,7 @@ def run(config: TrainConfig, prepare: Prepare) -> Outcome:
             steps = Finished.read(folder).steps
             console.print(f"already trained for {steps} steps: {folder.path}")
         else:
-            training = CategoryTraining(model, config, validation_names(data), distance)
+            training = CategoryTraining(model, config, data.validation_names(), distance)
             _train(training, data, opening.checkpoint, folder, seconds)
             if is_first():
                 save_model(training.model, folder.model)

@@ -23,22 +23,4 @@ def data_module(config: TrainConfig, prepared: list[PreparedData]) -> PairModule
                 f"no {split} pairs for {config.category.name}: see the preparation's report, "
                 f"and loosen the options under prep"
             )
-    return PairModule(
-        train,
-        validation,
-        image_size=config.model.image_size,
-        batch_size=config.trainer.batch_size,
-        batches_per_epoch=min(config.trainer.checkpoint_every, config.trainer.steps),
-        validation_examples=config.validation.examples,
-        validation_batch_size=config.validation.batch_size,
-        references=config.model.references,
-        workers=config.trainer.workers,
-        seed=config.seed,
-    )
-
-
-def validation_names(data: PairModule) -> list[list[str]]:
-    """What the held-out views of each validation batch are called."""
-    names = [data.validation.name(index) for index in data.chosen]
-    size = data.validation_batch_size
-    return [names[i : i + size] for i in range(0, len(names), size)]
+    return PairModule(train, validation, config)

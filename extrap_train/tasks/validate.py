@@ -25,7 +25,7 @@ from extrap_train.tasks.category import quieten_lightning
 from extrap_train.tasks.leakage import require_unseen
 from extrap_train.tasks.results import Results, write_results
 from extrap_train.tasks.scene_model import require_saved_options
-from extrap_train.tasks.training_data import Prepare, data_module, validation_names
+from extrap_train.tasks.training_data import Prepare, data_module
 from extrap_train.terminal import terminal
 
 
@@ -85,7 +85,7 @@ def _measure(
     distance, missing = lpips_or_reason(config.validation.lpips_weights)
     pairs = data_module(replace(config, model=model.config), data.prepared)
     validation = CategoryTraining(
-        use_channels_last(model), config, validation_names(pairs), distance
+        use_channels_last(model), config, pairs.validation_names(), distance
     )
     _validator(config).validate(validation, pairs, verbose=False)
     results = Results(

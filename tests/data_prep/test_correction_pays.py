@@ -94,26 +94,19 @@ def captures(tmp_path_factory: pytest.TempPathFactory) -> Captures:
 def configuration(seed: int) -> TrainConfig:
     """Of the packaged base, trained on for a little while: the average must forget soon."""
     options = ["category=hydrant", f"seed={seed}", f"trainer.steps={STEPS}"]
-    options += ["trainer.warmup_steps=20", "trainer.ema_decay=0.97"]
+    options += ["trainer.warmup_steps=20", "trainer.ema_decay=0.97", "trainer.workers=0"]
+    options += [f"trainer.checkpoint_every={STEPS}", f"validation.examples={VIEWS}"]
     register_schemas()
     with hydra.initialize_config_module("conf", version_base="1.3"):
         return typed_config(hydra.compose("train", options))
 
 
 def batches(config: TrainConfig, train: PreparedData, test: PreparedData) -> PairModule:
-    references = config.model.references
-    return PairModule(
-        ExampleReader([train], "train", references),
-        ExampleReader([test], "test", references),
-        image_size=config.model.image_size,
-        batch_size=config.trainer.batch_size,
-        batches_per_epoch=STEPS,
-        validation_examples=VIEWS,
-        validation_batch_size=config.validation.batch_size,
-        references=references,
-        workers=0,
-        seed=config.seed,
-    )
+    readers = [
+        ExampleReader([data], split, config.model.references)
+        for data, split in ((train, "train"), (test, "test"))
+    ]
+    return PairModule(*readers, config)
 
 
 def trained_and_tested(
@@ -123,9 +116,8 @@ def trained_and_tested(
     config = configuration(seed)
     torch.manual_seed(seed)
     modules = {name: batches(config, train, data) for name, data in tests.items()}
-    count = len(next(iter(modules.values())).chosen)
-    size = config.validation.batch_size
-    names = [[str(i) for i in range(at, min(at + size, count))] for at in range(0, count, size)]
+    batch_sizes = [len(batch) for batch in next(iter(modules.values())).held_out.batches]
+    names = [[f"{batch}-{i}" for i in range(size)] for batch, size in enumerate(batch_sizes)]
     training = CategoryTraining(initial_model(config.model), config, names, None)
     trainer = lightning.Trainer(
         accelerator="cpu",
