@@ -128,10 +128,7 @@ def _vanished_error(job: SequenceJob) -> InputError:
 
 
 def _sequence_row(
-    outcome: Outcome,
-    split: Split,
-    frames: Counter[str],
-    pairs: Counter[tuple[str, str]],
+    outcome: Outcome, split: Split, frames: Counter[str], pairs: Counter[tuple[str, str]]
 ) -> dict[str, Any]:
     """`frames` counts those that are stored; of a dropped sequence, all that it has."""
     verdict, sequence = outcome.verdict, outcome.sequence

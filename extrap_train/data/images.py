@@ -11,11 +11,7 @@ from PIL import Image
 from torch import Tensor
 
 from extrap_train.data.paths import require_file
-from extrap_train.data.picture_files import (
-    MAX_PIXELS,
-    read_turned,
-    same_view,
-)
+from extrap_train.data.picture_files import MAX_PIXELS, read_turned, same_view
 from extrap_train.errors import InputError
 
 BACKGROUND = 255

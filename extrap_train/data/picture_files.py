@@ -109,9 +109,7 @@ def same_view(size: tuple[int, int], other: tuple[int, int]) -> bool:
 
 
 def read_turned(
-    path: Path,
-    size: tuple[int, int],
-    fits: Callable[[tuple[int, int], tuple[int, int]], bool],
+    path: Path, size: tuple[int, int], fits: Callable[[tuple[int, int], tuple[int, int]], bool]
 ) -> Image.Image:
     """The decoded picture, turned by its EXIF orientation where only then its size fits `size`.
 

@@ -62,9 +62,7 @@ def _refine(
     return Estimate(found.clamp(*bounds), (1 - 2 * least).clamp(0, 1))
 
 
-def _best_index(
-    cost: Float[Tensor, "d h w"],
-) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+def _best_index(cost: Float[Tensor, "d h w"]) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
     """Index of the least cost, by a parabola through it and its neighbours; and that cost."""
     least, best = cost.min(0)
     inner = best.clamp(1, len(cost) - 2)[None]

@@ -31,11 +31,7 @@ class GrowthStatistics:
 
     @torch.no_grad()
     def add(
-        self,
-        gradient: Float[Tensor, "n 2"],
-        radii: Float[Tensor, " n"],
-        height: int,
-        width: int,
+        self, gradient: Float[Tensor, "n 2"], radii: Float[Tensor, " n"], height: int, width: int
     ) -> None:
         """One rendering's gradient to the projected centres, per pixel, and radii (0: unseen)."""
         seen = radii > 0

@@ -117,9 +117,7 @@ class Recipe:
             return parameters
         mean = torch.stack(colors).mean(0)
         return replace(
-            parameters,
-            sh_dc=rgb_to_sh(mean)[:, None],
-            sh_rest=torch.zeros_like(parameters.sh_rest),
+            parameters, sh_dc=rgb_to_sh(mean)[:, None], sh_rest=torch.zeros_like(parameters.sh_rest)
         )
 
     def draw(

@@ -199,9 +199,7 @@ def _depths_along_rays(
 
 
 def _robust_mean(
-    depths: Float[Tensor, "e h w"],
-    confidence: Float[Tensor, "e h w"],
-    trust: Float[Tensor, " e"],
+    depths: Float[Tensor, "e h w"], confidence: Float[Tensor, "e h w"], trust: Float[Tensor, " e"]
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
     """Redescending mean of log depth over the edges, and the share of confidence that agrees."""
     known = confidence > 0

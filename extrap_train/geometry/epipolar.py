@@ -69,10 +69,7 @@ def epipolar_directions(
 
 
 def steps_across(
-    pixels: Float[Tensor, "n 2"],
-    steps: Float[Tensor, "n 2"],
-    reference: Camera,
-    query: Camera,
+    pixels: Float[Tensor, "n 2"], steps: Float[Tensor, "n 2"], reference: Camera, query: Camera
 ) -> Float[Tensor, " n"]:
     """How far, in pixels, points of the query's picture leave their epipolar lines; ≥ 0."""
     along = epipolar_directions(pixels, reference, query)

@@ -114,7 +114,7 @@ def table(rng: np.random.Generator, floor_height: Real) -> list[Part]:
         top,
         Part(rounded_box((2 * x, 2 * y, 0.2)), edge, placement((0, 0, -0.102), turn), False, True),
     ]
-    leg = lathe(np.array([[0.14, floor_height], [0.2, -0.2]]), 10)
+    leg = lathe([[0.14, floor_height], [0.2, -0.2]], 10)
     cos, sin = np.cos(turn), np.sin(turn)
     for sx in (-1, 1):
         for sy in (-1, 1):

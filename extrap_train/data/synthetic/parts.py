@@ -29,10 +29,7 @@ class Part:
 
 
 def placement(
-    position: Point = (0, 0, 0),
-    turn_rad: Real = 0,
-    tilt_rad: Real = 0,
-    scale: Real = 1,
+    position: Point = (0, 0, 0), turn_rad: Real = 0, tilt_rad: Real = 0, scale: Real = 1
 ) -> Float[np.ndarray, "4 4"]:
     """Scale, then tilt about +X, then turn about +Z, then shift."""
     ct, st, cz, sz = np.cos(tilt_rad), np.sin(tilt_rad), np.cos(turn_rad), np.sin(turn_rad)

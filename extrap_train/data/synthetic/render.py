@@ -30,12 +30,7 @@ def render(scene: SyntheticScene, camera: Camera, supersample: int = 2) -> View:
     light = radiance(scene, *_rays(camera, supersample), float(1 / camera.intrinsics[0, 0]))
     light = light.reshape(height, supersample, width, supersample, 3).clip(0, 1).mean((1, 3))
     image = linear_to_srgb(light).transpose(2, 0, 1).astype(np.float32)
-    return View(
-        torch.from_numpy(np.ascontiguousarray(image)),
-        camera,
-        depth,
-        mask,
-    )
+    return View(torch.from_numpy(np.ascontiguousarray(image)), camera, depth, mask)
 
 
 def trace(

@@ -1,7 +1,9 @@
 """Triangle meshes with smooth normals from a handful of primitives; +Z is up."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -12,6 +14,8 @@ _CREASE = np.cos(np.deg2rad(35.0))
 
 
 Point = tuple[Real, Real, Real] | Float[np.ndarray, " 3"]
+Rows = np.ndarray | Sequence[Any]
+"""An array, or what makes one."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +32,7 @@ def xyz(x: Real, y: Real, z: Real) -> Float[np.ndarray, " 3"]:
     return np.array([x, y, z], float)
 
 
-def lathe(profile: Float[np.ndarray, "k 2"], segments: int = 32) -> Mesh:
+def lathe(profile: Rows, segments: int = 32) -> Mesh:
     """The surface of revolution of (radius, height) points around +Z; sharp corners stay sharp."""
     rings = _split_corners(np.asarray(profile, float))
     angles = np.linspace(0, 2 * np.pi, segments, endpoint=False)
@@ -56,10 +60,7 @@ def _split_corners(profile: Float[np.ndarray, "k 2"]) -> list[np.ndarray]:
 
 
 def sweep(
-    path: Float[np.ndarray, "k 3"],
-    radii: Float[np.ndarray, " k"] | Real,
-    segments: int = 10,
-    flatten: float = 1.0,
+    path: Rows, radii: Float[np.ndarray, " k"] | Real, segments: int = 10, flatten: float = 1.0
 ) -> Mesh:
     """A tube along a path, closed by small domes; `flatten` scales its sideways direction."""
     path = np.asarray(path, float)
@@ -145,10 +146,7 @@ def capsule(
     axis = (end - start) / np.linalg.norm(end - start)
     angles = np.linspace(0, np.pi / 2, 6)
     along = np.concatenate(
-        [
-            -radius * np.cos(angles),
-            np.linalg.norm(end - start) + last * np.sin(angles),
-        ]
+        [-radius * np.cos(angles), np.linalg.norm(end - start) + last * np.sin(angles)]
     )
     across = np.concatenate([radius * np.sin(angles), last * np.cos(angles)])
     side = _sideways(axis[None])[0]
@@ -158,7 +156,7 @@ def capsule(
     return _grid_mesh(vertices, np.arange(len(along) - 1), closed=True)
 
 
-def sheet(points: Float[np.ndarray, "r c 3"]) -> Mesh:
+def sheet(points: Rows) -> Mesh:
     """An open surface through a grid of points, seen from both sides."""
     return _grid_mesh(np.asarray(points, float), np.arange(len(points) - 1), closed=False)
 

@@ -202,7 +202,7 @@ def _foliage(rng: np.random.Generator, spot: Point, size: Real) -> Part:
 def _tree(rng: np.random.Generator, spot: Point, turn: Real) -> list[Part]:
     height = rng.uniform(2.0, 3.2)
     bark = vary_color(rng, ["#5a4632", "#7a6a55", "#4a4038"])
-    trunk = lathe(np.array([[0.22, 0], [0.14, 0.4], [0.11, height]]), 12)
+    trunk = lathe([[0.22, 0], [0.14, 0.4], [0.11, height]], 12)
     texture = Mottled(bark * 0.5, bark * 1.4, 7.0, draw_seed(rng), 3, stretch=(1, 1, 0.25))
     crown = (spot[0], spot[1], height + 0.5)
     return [
@@ -266,8 +266,8 @@ def _cabinet(rng: np.random.Generator, spot: Point, turn: Real, scale: Real = 1.
 def _lamp(rng: np.random.Generator, spot: Point, turn: Real, scale: Real = 1.0) -> list[Part]:
     height = rng.uniform(1.6, 2.4) * scale
     metal = Material(Plain(vary_color(rng, ["#3a3a3c", "#a08a5a", "#c8c8c8"])), 0.4)
-    pole = lathe(np.array([[0.3, 0], [0.3, 0.05], [0.04, 0.07], [0.04, height]]), 12)
-    shade = lathe(np.array([[0.38, height - 0.3], [0.22, height + 0.25]]), 20)
+    pole = lathe([[0.3, 0], [0.3, 0.05], [0.04, 0.07], [0.04, height]], 12)
+    shade = lathe([[0.38, height - 0.3], [0.22, height + 0.25]], 20)
     cloth = Material(Plain(vary_color(rng, ["#e8d9b0", "#d9a45a", "#dfe0da", "#c77f6a"])), glow=1)
     return [_scenery(pole, metal, spot, turn), _scenery(shade, cloth, spot, turn)]
 
@@ -295,7 +295,7 @@ def _small_thing(rng: np.random.Generator, spot: Point, turn: Real) -> list[Part
         case 1:
             h, r = rng.uniform(0.35, 0.6), rng.uniform(0.07, 0.13)
             profile = [[r, 0], [r, 0.6 * h], [r * 0.4, 0.8 * h], [r * 0.4, h], [0, h]]
-            return [_scenery(lathe(np.array(profile), 16), material, spot, turn)]
+            return [_scenery(lathe(profile, 16), material, spot, turn)]
         case _:
             r = rng.uniform(0.1, 0.2)
             middle = (spot[0], spot[1], r)

@@ -39,9 +39,7 @@ def project_pixels(
     return x / safe, y / safe, ratio
 
 
-def subdivide(
-    counts: Int[Tensor, "n 2"],
-) -> tuple[Int[Tensor, " m"], Float[Tensor, "m 2"]]:
+def subdivide(counts: Int[Tensor, "n 2"]) -> tuple[Int[Tensor, " m"], Float[Tensor, "m 2"]]:
     """Each point's pixel, and where in it the point lies: (u, v) from the centre, in (−½, ½)."""
     total = counts[:, 0] * counts[:, 1]
     pixel = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), total)

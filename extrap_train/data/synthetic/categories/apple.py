@@ -72,7 +72,7 @@ def build(rng: np.random.Generator) -> list[Part]:
     length = rng.uniform(0.2, 0.36)
     path = [[*(lean * t * t), top + 0.02 + length * t] for t in np.linspace(0, 1, 6)]
     bark = vary_color(rng, ["#5a4027", "#6e5a34", "#46351f"])
-    stem = sweep(np.array(path), np.linspace(0.018, 0.028, 6), 8)
+    stem = sweep(path, np.linspace(0.018, 0.028, 6), 8)
     parts.append(Part(stem, Material(Mottled(bark * 0.6, bark * 1.4, 12.0, draw_seed(rng))), pose))
     if rng.random() < 0.5:
         green = vary_color(rng, ["#4f7f2f", "#6f9a3f", "#3f6a35"])

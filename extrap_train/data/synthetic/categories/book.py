@@ -103,13 +103,7 @@ class Pages:
 
 
 def _lettering(
-    u: Numbers,
-    v: Numbers,
-    rows: int,
-    pitch: Real,
-    half_width: Real,
-    seed: int,
-    blur: Numbers,
+    u: Numbers, v: Numbers, rows: int, pitch: Real, half_width: Real, seed: int, blur: Numbers
 ) -> Numbers:
     """Rows of dashes like words seen from afar, centred at (0, 0), `pitch` apart."""
     line = np.floor(rows / 2 - v / pitch)

@@ -7,15 +7,7 @@ import numpy as np
 from extrap_train.data.synthetic.ground import CLOTHS, WOODS, draw_seed
 from extrap_train.data.synthetic.material import Material, Mottled, Plaid, Plain, Wood, vary_color
 from extrap_train.data.synthetic.parts import Part, placement
-from extrap_train.data.synthetic.shapes import (
-    Mesh,
-    capsule,
-    lathe,
-    rounded_box,
-    sheet,
-    sweep,
-    xyz,
-)
+from extrap_train.data.synthetic.shapes import Mesh, capsule, lathe, rounded_box, sheet, sweep, xyz
 from extrap_train.data.synthetic.vectors import Real
 
 Back = Callable[[float, float], np.ndarray]
@@ -95,10 +87,10 @@ def _legs(rng: np.random.Generator, size: tuple[Real, Real, Real], frame: Materi
 def _pedestal(rng: np.random.Generator, seat: Real, width: Real) -> list[Part]:
     """A column on a round foot or on five spokes with castors."""
     metal = Material(Plain(vary_color(rng, ["#8f9296", "#2c2c30", "#c9c9c6"])), 0.6, 50)
-    column = lathe(np.array([[0.035, 0.05], [0.035, 0.2], [0.025, 0.2], [0.025, seat]]), 16)
+    column = lathe([[0.035, 0.05], [0.035, 0.2], [0.025, 0.2], [0.025, seat]], 16)
     if rng.random() < 0.4:
         foot = [[0, 0], [width * 0.5, 0], [width * 0.5, 0.02], [0.05, 0.06], [0, 0.06]]
-        return [Part(column, metal), Part(lathe(np.array(foot), 32), metal)]
+        return [Part(column, metal), Part(lathe(foot, 32), metal)]
     parts = [Part(column, metal)]
     for turn in 2 * np.pi * np.arange(5) / 5:
         tip = np.array([np.cos(turn), np.sin(turn), 0.0]) * width * 0.55
@@ -126,7 +118,7 @@ def _back(
         case 0:
             count = int(rng.integers(3, 7))
             bars = [
-                Part(sweep(np.array([at(s, t) for t in heights]), 0.014, 8), frame)
+                Part(sweep([at(s, t) for t in heights], 0.014, 8), frame)
                 for s in np.linspace(-1, 1, count + 2)[1:-1]
             ]
             return [*posts, *bars, _rail(at, 1.0, 0.035, frame)]
@@ -154,7 +146,7 @@ def _rail(at: Back, share_z: Real, half: Real, frame: Material) -> Part:
 def _panel(at: Back, low: Real, high: Real) -> Mesh:
     """A bent board between the posts."""
     grid = [[at(s, t) for s in np.linspace(-1, 1, 8)] for t in np.linspace(low, high, 8)]
-    return sheet(np.array(grid))
+    return sheet(grid)
 
 
 def _armrests(

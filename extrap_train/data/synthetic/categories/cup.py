@@ -201,7 +201,7 @@ def _drink(
     level = height * rng.uniform(0.7, 0.9)
     radius = np.interp(level, profile[:, 1], profile[:, 0]) - wall * 0.8
     color = vary_color(rng, ["#3a2012", "#7a4a22", "#a8702f", "#cdbb9c"])
-    disc = lathe(np.array([[radius, level], [0, level]]), 32)
+    disc = lathe([[radius, level], [0, level]], 32)
     return Part(disc, Material(Mottled(color * 0.8, color * 1.2, 5.0, draw_seed(rng)), 0.8, 120))
 
 
@@ -215,4 +215,4 @@ def _saucer(rng: np.random.Generator, rim: Real, glaze: Material) -> Part:
         [wide * 0.55, 0.05],
         [0, 0.045],
     ]
-    return Part(lathe(np.array(profile), 40), glaze)
+    return Part(lathe(profile, 40), glaze)

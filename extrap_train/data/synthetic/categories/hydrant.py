@@ -64,12 +64,12 @@ def _barrel(rng: np.random.Generator, radius: Real, shoulder: Real) -> Mesh:
         [radius, shoulder - 0.2], [radius, shoulder - 0.03], [ring + 0.01, shoulder - 0.02],
         [ring + 0.01, shoulder + 0.01], [0, shoulder + 0.01],
     ]  # fmt: skip
-    return lathe(np.array(profile), 32)
+    return lathe(profile, 32)
 
 
 def _bolts(rng: np.random.Generator, radius: Real) -> Mesh:
     """A ring of bolts on the base flange."""
-    bolt = lathe(np.array([[0.022, 0.04], [0.022, 0.075], [0, 0.08]]), 6)
+    bolt = lathe([[0.022, 0.04], [0.022, 0.075], [0, 0.08]], 6)
     count = int(rng.integers(5, 9))
     turns = np.arange(count) * 2 * np.pi / count
     spots = [(float(np.cos(t)), float(np.sin(t))) for t in turns]
@@ -112,14 +112,7 @@ def _nozzles(
     pipe = radius + rng.uniform(0.035, 0.06)
     bore = 0.058 * size
     neck = lathe(
-        np.array(
-            [
-                [bore, 0],
-                [bore, pipe - 0.01],
-                [bore * 1.25, pipe - 0.01],
-                [bore * 1.25, pipe + 0.015],
-            ]
-        ),
+        [[bore, 0], [bore, pipe - 0.01], [bore * 1.25, pipe - 0.01], [bore * 1.25, pipe + 0.015]],
         20,
     )
     lid = [
@@ -129,7 +122,7 @@ def _nozzles(
         [0, pipe + 0.07],
     ]
     nut = [[0.024 * size, pipe + 0.06], [0.02 * size, pipe + 0.105], [0, pipe + 0.105]]
-    caps = merge([lathe(np.array(lid), int(rng.choice([8, 20]))), lathe(np.array(nut), 5)])
+    caps = merge([lathe(lid, int(rng.choice([8, 20]))), lathe(nut, 5)])
     parts = []
     for turn in turns:
         pose = placement((0, 0, height), turn + np.pi / 2, np.pi / 2)

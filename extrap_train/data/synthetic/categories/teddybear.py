@@ -110,7 +110,7 @@ def _bow(rng: np.random.Generator, at: tuple[Real, Real, Real]) -> Part:
     loops = [move_mesh(loop, placement((side * size * 1.05, 0, 0))) for side in (-1, 1)]
     knot = ellipsoid((size * 0.35,) * 3, 12)
     tails = [
-        sweep(np.array([[0, 0, 0], [x * 0.6, -0.02, -size], [x, -0.02, -size * 1.7]]), 0.02, 6)
+        sweep([[0, 0, 0], [x * 0.6, -0.02, -size], [x, -0.02, -size * 1.7]], 0.02, 6)
         for x in (-size, size)
     ]
     color = vary_color(rng, ["#b3272f", "#2f4fa0", "#d9b23a", "#2f7a4f", "#8a3f8f", "#e0e0dc"])
