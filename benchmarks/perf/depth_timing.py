@@ -6,7 +6,7 @@ from torch import Tensor
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from benchmarks.perf.timing import Row, compare
-from extrap_train.depth.mast3r.network import Architecture, PointMapNetwork
+from extrap_train.depth.mast3r.point_map_network import Architecture, PointMapNetwork
 
 HEIGHT, WIDTH = 384, 512
 REPEATS = {"cpu": 1, "cuda": 15}

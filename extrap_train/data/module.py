@@ -8,7 +8,7 @@ import numpy as np
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from extrap_train.config import TrainConfig
-from extrap_train.data.examples import Example, ExampleReader, linspace_indices, mirror
+from extrap_train.data.pair_examples import Example, ExampleReader, linspace_indices, mirror
 from extrap_train.geometry.reduction import reduce_batch
 from extrap_train.geometry.warp import warp_references
 from extrap_train.views import PairBatch

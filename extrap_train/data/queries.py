@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 
 from extrap_train.data.camera_check import is_degenerate
-from extrap_train.data.examples import Example, collate
+from extrap_train.data.pair_examples import Example, collate
 from extrap_train.depth import require_depth
 from extrap_train.errors import InputError
 from extrap_train.geometry.viewpoints import references_by_nearness

@@ -16,7 +16,7 @@ from extrap_train.config import (
 )
 from extrap_train.depth import DepthSource
 from extrap_train.depth.dataset import DatasetDepth
-from extrap_train.depth.mast3r.checkpoint import read_network
+from extrap_train.depth.mast3r.mast3r_checkpoint import read_network
 from extrap_train.depth.mast3r.source import Mast3rDepth
 from extrap_train.depth.monocular import MonocularDepth
 from extrap_train.depth.stereo import PlaneSweepStereo

@@ -12,7 +12,7 @@ from lightning.fabric import Fabric
 from rich.console import Console
 
 from extrap_train.config import TrainConfig, dotted, sampler_for
-from extrap_train.data.examples import linspace_indices
+from extrap_train.data.pair_examples import linspace_indices
 from extrap_train.data.scene import scene_address
 from extrap_train.data.scene_pairs import AdaptationPairs, adaptation_pairs
 from extrap_train.data.scene_views import target_views

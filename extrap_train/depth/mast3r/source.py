@@ -12,7 +12,7 @@ from torch.nn import functional
 from extrap_train.config import Mast3rConfig
 from extrap_train.depth import DepthMap, PointMaps, point_maps_of
 from extrap_train.depth.mast3r.known_cameras import posed_depths
-from extrap_train.depth.mast3r.network import Encoding, PointMapNetwork
+from extrap_train.depth.mast3r.point_map_network import Encoding, PointMapNetwork
 from extrap_train.depth.neighbours import WIDEST_RAD, neighbours_of
 from extrap_train.errors import InputError
 from extrap_train.views import Camera, View, combine

@@ -1,7 +1,7 @@
 """The warped image: what the references show of the query view (paper II-A, Eq. 1).
 
 `warp_references` is the whole of it. Each step is there twice: in torch, for GPUs and gradients,
-and in `_numba` in compiled loops for the CPU. The torch files explain the method and own its
+and in the `*_numba` files in compiled loops for the CPU. The torch files explain the method and own its
 constants; both give the same picture within rounding, and the loops give the same bits for any
 number of threads.
 """
@@ -13,10 +13,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from extrap_train.geometry.warp._numba.sample import move_points_numba, sample_surfaces_numba
-from extrap_train.geometry.warp._numba.splat import project_numba, splat_numba
 from extrap_train.geometry.warp.sample import move_points, sample_surfaces
+from extrap_train.geometry.warp.sample_numba import move_points_numba, sample_surfaces_numba
 from extrap_train.geometry.warp.splat import OUTSIDE, ScreenPoints, splat_torch
+from extrap_train.geometry.warp.splat_numba import project_numba, splat_numba
 from extrap_train.views import Camera, Warp
 
 NEAREST_SHARE = 0.02

@@ -6,8 +6,8 @@ import torch
 from safetensors.torch import load_file
 from tiny import TINY, tiny_state, write_checkpoint
 
-from extrap_train.depth.mast3r.checkpoint import read_network
-from extrap_train.depth.mast3r.network import Architecture, PointMapNetwork
+from extrap_train.depth.mast3r.mast3r_checkpoint import read_network
+from extrap_train.depth.mast3r.point_map_network import Architecture, PointMapNetwork
 
 SMALL = replace(TINY, decoder_depth=4)
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from extrap_train.config import Mast3rConfig
 from extrap_train.depth.mast3r.heads import LEVEL_WIDTHS
-from extrap_train.depth.mast3r.network import Architecture, PointMapNetwork
+from extrap_train.depth.mast3r.point_map_network import Architecture, PointMapNetwork
 from extrap_train.weight_files import WeightFile
 
 HEAD_WIDTH = 64

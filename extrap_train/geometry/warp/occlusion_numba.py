@@ -29,7 +29,7 @@ def project(m, u, v, inverse):
 @compiled()
 def draw_occlusion(inverse, links, intrinsics, m, unseen):
     """Lower one reference's depth buffer `unseen` to the walls behind its occluding edges; links
-    as in `_numba.surface`."""
+    as in `surface_numba`."""
     height, width = inverse.shape
     for y in range(height):
         for x in range(width):

@@ -16,10 +16,10 @@ from extrap_train.geometry.compiled import compiled
 from extrap_train.geometry.encoding import coordinate_grid
 from extrap_train.geometry.spline_flow import flow_at_pixels
 from extrap_train.geometry.warp import occlusion, sample
-from extrap_train.geometry.warp._numba.occlusion import draw_occlusion, project
-from extrap_train.geometry.warp._numba.surface import find_surface
+from extrap_train.geometry.warp.occlusion_numba import draw_occlusion, project
 from extrap_train.geometry.warp.query_projection import LEAST_DEPTH_RATIO, reference_to_query_pixels
 from extrap_train.geometry.warp.sample import query_centers
+from extrap_train.geometry.warp.surface_numba import find_surface
 from extrap_train.views import Camera
 
 _ZERO, _HALF, _ONE, _TWO = (np.float32(x) for x in (0, 0.5, 1, 2))
