@@ -1,9 +1,9 @@
 """The warped image: what the references show of the query view (paper II-A, Eq. 1).
 
 `warp_references` is the whole of it. Each step is there twice: in torch, for GPUs and gradients,
-and in the `*_numba` files in compiled loops for the CPU. The torch files explain the method and own its
-constants; both give the same picture within rounding, and the loops give the same bits for any
-number of threads.
+and as compiled loops for the CPU, in the file whose name ends in `_numba`. The torch files explain
+the method and own its constants; both give the same picture within rounding, and the loops give the
+same bits for any number of threads.
 """
 
 from dataclasses import dataclass

@@ -18,7 +18,7 @@ _ACROSS = occlusion.ACROSS
 
 @compiled()
 def project(m, u, v, inverse):
-    """`projection.project_pixels` of one pixel."""
+    """`query_projection.project_pixels` of one pixel."""
     x = m[0, 0] * u + m[0, 1] * v + m[0, 2] + m[0, 3] * inverse
     y = m[1, 0] * u + m[1, 1] * v + m[1, 2] + m[1, 3] * inverse
     ratio = m[2, 0] * u + m[2, 1] * v + m[2, 2] + m[2, 3] * inverse
