@@ -177,4 +177,5 @@ def _check_processes(config: Any) -> None:
 def _use_threads(threads: int | None) -> None:
     if threads is not None:
         os.environ["OMP_NUM_THREADS"] = str(threads)
-        os.environ["NUMBA_NUM_THREADS"] = str(threads)
+        if "numba" not in sys.modules:  # which refuses another number once its threads run
+            os.environ["NUMBA_NUM_THREADS"] = str(threads)
