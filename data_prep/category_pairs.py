@@ -73,7 +73,7 @@ def prepare_category(
     correction = asdict(how) if how else None
     frames_of = [category, _source(data), asdict(depth), prep.image_size]
     pairs_of = [*frames_of, pair_options(prep), correction]
-    all_of = [category, _said(data), asdict(depth), asdict(prep), correction]
+    all_of = [category, asdict(data), asdict(depth), asdict(prep), correction]
     frames, pairs, folder = (
         output / kind / f"{category}-{_digest(made_of)}"
         for kind, made_of in (("frames", frames_of), ("pairs", pairs_of), ("data", all_of))
@@ -152,11 +152,6 @@ def _sequences(
         return sequences, data.test_sequences
     split = read_sequence_split(root, category, data.set_list)
     return [s for s in sequences if s.name in split.train | split.test], set(split.test)
-
-
-def _said(data: DataConfig) -> dict[str, Any]:
-    """The options without one that came later and is not given: preparations keep their names."""
-    return {k: value for k, value in asdict(data).items() if (k, value) != ("set_list", None)}
 
 
 def _source(data: DataConfig) -> dict[str, Any]:

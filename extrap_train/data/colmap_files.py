@@ -13,7 +13,7 @@ from typing import Any
 
 from extrap_train.data.paths import MAX_PATH_BYTES
 from extrap_train.errors import InputError
-from extrap_train.geometry.colmap import PARAMETER_COUNTS
+from extrap_train.geometry.colmap import NAMES_AND_COUNTS
 
 _MAX_LINE_CHARACTERS = 2**24
 """A line of points takes about twenty for each."""
@@ -26,8 +26,7 @@ class ModelCamera:
     """A camera of a model, of any of COLMAP's camera models."""
 
     number: int
-    model: str | int
-    """Its name, or its number as a binary file has it."""
+    model: str
     height: int
     width: int
     parameters: tuple[float, ...]
@@ -43,9 +42,14 @@ class ModelImage:
     translation: tuple[float, ...]
 
 
-def read_model_cameras(file: Path) -> list[ModelCamera]:
-    """Every camera of a `cameras.bin` or `cameras.txt`."""
-    return _binary_cameras(file) if file.suffix == ".bin" else _text_cameras(file)
+def read_model_cameras(file: Path) -> dict[int, ModelCamera]:
+    """Every camera of a `cameras.bin` or `cameras.txt`, by its number."""
+    found: dict[int, ModelCamera] = {}
+    for camera in _binary_cameras(file) if file.suffix == ".bin" else _text_cameras(file):
+        if camera.number in found:
+            raise InputError(f"{file}: lists camera {camera.number} twice; export the model again")
+        found[camera.number] = camera
+    return found
 
 
 def read_model_images(file: Path) -> list[ModelImage]:
@@ -101,14 +105,14 @@ def _binary_cameras(file: Path) -> list[ModelCamera]:
     with _cursor(file) as cursor:
         for _ in range(*cursor.read("Q")):
             number, model, width, height = cursor.read("iiQQ")
-            if model not in PARAMETER_COUNTS:
+            if model not in NAMES_AND_COUNTS:
                 raise InputError(
                     f"{file}: camera {number} is of a model that has the number {model}, and the "
-                    f"models known here end at {max(PARAMETER_COUNTS)}; run COLMAP's "
+                    f"models known here end at {max(NAMES_AND_COUNTS)}; run COLMAP's "
                     "image_undistorter first"
                 )
-            parameters = cursor.read(f"{PARAMETER_COUNTS[model]}d")
-            cameras.append(ModelCamera(number, model, height, width, parameters))
+            name, count = NAMES_AND_COUNTS[model]
+            cameras.append(ModelCamera(number, name, height, width, cursor.read(f"{count}d")))
     return cameras
 
 

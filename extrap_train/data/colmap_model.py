@@ -21,7 +21,6 @@ from extrap_train.data.sequences import FrameSequence, PointCloud
 from extrap_train.errors import InputError
 from extrap_train.geometry.colmap import (
     CAMERA_MODELS,
-    OTHER_MODELS,
     lens_from_parameters,
     world_to_cam_from_colmap,
 )
@@ -78,11 +77,10 @@ def read_model(model: Path, images: Path, name: str) -> FrameSequence:
     cameras, entries = read_model_cameras(cameras_file), read_model_images(images_file)
     if not entries:
         raise InputError(f"{images_file}: lists no picture; run COLMAP again")
-    by_number = _by_number(cameras, cameras_file)
     listed = [
         Listed(
             check_relative(entry.name, images_file),
-            partial(_photograph, entry, by_number, cameras_file),
+            partial(_photograph, entry, cameras, cameras_file),
         )
         for entry in entries
     ]
@@ -107,15 +105,6 @@ def _count_images(model: Path) -> int:
         return 0
 
 
-def _by_number(cameras: list[ModelCamera], file: Path) -> dict[int, ModelCamera]:
-    found: dict[int, ModelCamera] = {}
-    for camera in cameras:
-        if camera.number in found:
-            raise InputError(f"{file}: lists camera {camera.number} twice; export the model again")
-        found[camera.number] = camera
-    return found
-
-
 def _photograph(
     entry: ModelImage, cameras: dict[int, ModelCamera], file: Path, path: str
 ) -> Photograph:
@@ -138,14 +127,10 @@ def _photograph(
 
 def _lens(camera: ModelCamera, file: Path) -> Lens:
     """InputError where the model cannot be undone or the entry makes no sense."""
-    known = (m for m in CAMERA_MODELS if camera.model in (m.name, m.number))
-    model = next(known, None)
+    model = next((model for model in CAMERA_MODELS if model.name == camera.model), None)
     if model is None:
-        name = camera.model
-        if isinstance(name, int) and name in OTHER_MODELS:
-            name = OTHER_MODELS[name][0]
         raise InputError(
-            f"{file}: camera {camera.number} is of the model {name}, and only "
+            f"{file}: camera {camera.number} is of the model {camera.model}, and only "
             f"{', '.join(m.name for m in CAMERA_MODELS)} can be undone; run COLMAP's "
             "image_undistorter first"
         )

@@ -41,7 +41,9 @@ CAMERA_MODELS = (
     CameraModel(15, "FISHEYE", ("fx", "fy", "cx", "cy"), True),
 )
 
-OTHER_MODELS = {
+NAMES_AND_COUNTS = {
+    model.number: (model.name, len(model.parameters)) for model in CAMERA_MODELS
+} | {
     7: ("FOV", 5),
     10: ("THIN_PRISM_FISHEYE", 12),
     11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
@@ -50,11 +52,8 @@ OTHER_MODELS = {
     16: ("EUCM", 6),
     17: ("EQUIRECTANGULAR", 2),
 }
-"""COLMAP's other models by number: name and how many parameters. None of these can be undone."""
-PARAMETER_COUNTS = {model.number: len(model.parameters) for model in CAMERA_MODELS} | {
-    number: count for number, (_, count) in OTHER_MODELS.items()
-}
-"""How many parameters a camera has, by the number of its model."""
+"""Name and number of parameters of every model of COLMAP's; those not in `CAMERA_MODELS` cannot be
+undone."""
 
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE_COEFFICIENTS = ("k1", "k2", "k3", "k4")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from captures import write_capture
 
-from data_prep.category_pairs import _said, prepare_category
+from data_prep.category_pairs import prepare_category
 from extrap_train.config import Co3dConfig, DatasetDepthConfig, FlowMatcherConfig, PrepConfig
 
 
@@ -24,8 +24,3 @@ def test_a_set_list_says_what_is_trained_and_tested_on(tmp_path: Path) -> None:
         matcher=FlowMatcherConfig(),
     )
     assert prepared.roles == {"cup/a": "train", "cup/b": "test", "cup/c": "train", "cup/d": "test"}
-
-
-def test_without_a_set_list_preparations_are_called_as_before_there_was_one() -> None:
-    assert _said(Co3dConfig(root="x")) == {"name": "co3d", "root": "x", "test_sequences": 5}
-    assert _said(Co3dConfig(root="x", set_list="dev"))["set_list"] == "dev"
