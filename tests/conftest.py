@@ -1,8 +1,11 @@
 """Fixtures that every test may use, and how the tests share the machine."""
 
+import multiprocessing
 import os
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from multiprocessing import forkserver
+from multiprocessing.context import ForkServerContext
 from pathlib import Path
 
 # One thread per worker, and per command that a test starts: the workers share the cores.
@@ -15,6 +18,16 @@ from shape_checks import check_shapes
 
 check_shapes()
 
+_FORKED = (
+    "data_prep.category_pairs",
+    "extrap_train.tasks.category",
+    "benchmarks.run_table",
+    "benchmarks.run.run_method",
+    "benchmarks.methods.adapted",
+    "benchmarks.methods.incremental",
+    "benchmarks.methods.dngaussian",
+)
+"""What jobs import that run in processes of their own."""
 _MOST_WORKERS = 8  # each holds about 2 GiB
 
 
@@ -39,6 +52,18 @@ def shared() -> Path:
     if not folder.is_dir():
         pytest.skip("needs the folder of real photographs and weights beside the checkout")
     return folder
+
+
+@pytest.fixture(scope="session")
+def fork_server() -> ForkServerContext:
+    """Starts processes that need import nothing, methods under test among them.
+
+    A process has one such server, and the first who starts it decides what it has imported.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([*_FORKED])
+    forkserver.ensure_running()
+    return context
 
 
 def _use_one_thread() -> None:

@@ -5,7 +5,6 @@ its result.
 import importlib
 import io
 import json
-import multiprocessing
 import os
 import shutil
 import signal
@@ -13,6 +12,7 @@ import sys
 import time
 from contextlib import redirect_stdout
 from dataclasses import dataclass
+from multiprocessing.context import ForkServerContext
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
@@ -38,11 +38,6 @@ _OPTIONS = [
 
 def _arguments(output: Path, *more: str) -> list[str]:
     return [*_OPTIONS, f"output={output}", *more]
-
-
-_SERVER = multiprocessing.get_context("forkserver")
-"""Forks jobs that are killed: it has imported the program once for all of them."""
-_SERVER.set_forkserver_preload(["extrap_train.tasks.category", "data_prep.category_pairs"])
 
 
 @dataclass(frozen=True)
@@ -80,8 +75,8 @@ def _run_job(output: Path, kill: _Kill | None) -> None:
     main()
 
 
-def _start(output: Path, kill: _Kill | None = None) -> BaseProcess:
-    job = _SERVER.Process(target=_run_job, args=(output, kill))
+def _start(fork_server: ForkServerContext, output: Path, kill: _Kill | None = None) -> BaseProcess:
+    job = fork_server.Process(target=_run_job, args=(output, kill))
     job.start()
     return job
 
@@ -160,9 +155,9 @@ def test_a_finished_run_is_measured_again_sampled_otherwise(
     assert (run / "summary.json").read_bytes() == before
 
 
-def _kill_at_file(output: Path, pattern: str) -> None:
+def _kill_at_file(fork_server: ForkServerContext, output: Path, pattern: str) -> None:
     """Start the job and kill it once such a file is there."""
-    job = _start(output)
+    job = _start(fork_server, output)
     while job.is_alive() and not any(output.glob(pattern)):
         time.sleep(0.02)
     assert job.is_alive(), _said(output)
@@ -170,8 +165,8 @@ def _kill_at_file(output: Path, pattern: str) -> None:
     job.join()
 
 
-def _kill_within(output: Path, kill: _Kill) -> None:
-    job = _start(output, kill)
+def _kill_within(fork_server: ForkServerContext, output: Path, kill: _Kill) -> None:
+    job = _start(fork_server, output, kill)
     job.join(timeout=300)
     assert job.exitcode == -signal.SIGKILL, _said(output)
 
@@ -185,26 +180,28 @@ def _checkpoints(output: Path) -> list[str]:
 
 
 def test_killed_within_a_checkpoint_the_weights_are_the_same(
-    undisturbed: Path, tmp_path: Path
+    fork_server: ForkServerContext, undisturbed: Path, tmp_path: Path
 ) -> None:
     """SIGKILL with half of the checkpoint written; then run to the end."""
     _link_data(undisturbed, tmp_path)
-    _kill_within(tmp_path, _WITHIN_CHECKPOINT)
+    _kill_within(fork_server, tmp_path, _WITHIN_CHECKPOINT)
     assert _checkpoints(tmp_path) == ["step-00000003.ckpt"], "killed within writing the second"
     _finish(tmp_path)
     _require_same(tmp_path, undisturbed)
 
 
 @pytest.mark.slow
-def test_killed_again_and_again_the_weights_are_the_same(undisturbed: Path, tmp_path: Path) -> None:
+def test_killed_again_and_again_the_weights_are_the_same(
+    fork_server: ForkServerContext, undisturbed: Path, tmp_path: Path
+) -> None:
     """SIGKILL while sequences are rendered, within the writing of a checkpoint, within the
     validation behind it, and right after the last one; then run to the end.
     """
-    _kill_at_file(tmp_path, "synthetic/hydrant/0000/**/*.jpg")
-    _kill_within(tmp_path, _WITHIN_CHECKPOINT)
-    _kill_within(tmp_path, _WITHIN_VALIDATION)
+    _kill_at_file(fork_server, tmp_path, "synthetic/hydrant/0000/**/*.jpg")
+    _kill_within(fork_server, tmp_path, _WITHIN_CHECKPOINT)
+    _kill_within(fork_server, tmp_path, _WITHIN_VALIDATION)
     assert not (_run_folder(tmp_path) / "metrics.csv").read_text().count("validation/")
-    _kill_at_file(tmp_path, "train/hydrant/small/*/checkpoints/step-00000012.ckpt")
+    _kill_at_file(fork_server, tmp_path, "train/hydrant/small/*/checkpoints/step-00000012.ckpt")
     _finish(tmp_path)
     _require_same(tmp_path, undisturbed)
 

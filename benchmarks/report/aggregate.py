@@ -93,6 +93,15 @@ class Results:
         A method that lacks cells has no rank: its mean is of other captures. Where most methods
         lack some, none has: who is best would be a matter of who is left.
         """
+        if category not in self._means:
+            self._means[category] = self._compute_means(category)
+        return self._means[category]
+
+    @cached_property
+    def _means(self) -> dict[str | None, pd.DataFrame]:
+        return {}
+
+    def _compute_means(self, category: str | None) -> pd.DataFrame:
         table = self.tidy[self.tidy["metric"] != ""].dropna(subset=["value"])
         if category is not None:
             table = table[table["category"] == category]

@@ -1,6 +1,7 @@
 """A small finished table that tests read, or damage a copy of."""
 
 import shutil
+from multiprocessing.context import ForkServerContext
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ from tests.benchmarks.tables import run_greys, write_own
 
 
 @pytest.fixture(scope="session")
-def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def own(fork_server: ForkServerContext, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A third party's folder of methods and tables."""
     return write_own(tmp_path_factory.mktemp("own"))
 

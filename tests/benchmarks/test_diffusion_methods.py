@@ -4,6 +4,7 @@ import shutil
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ from extrap_train.jobs.local import LocalLauncher
 from extrap_train.views import View
 from tests.benchmarks.analytic import scene_inputs
 
-STEPS = 50
+STEPS = 8
 VARIANTS: dict[str, Diffusion] = {
     "ours": Diffusion(),
     "one reference": Diffusion(references=1),
@@ -251,7 +252,9 @@ def test_an_option_that_cannot_be_meant_is_refused(options: dict[str, Any]) -> N
         build_method(Catalogue().method("ours_lora", options))
 
 
-def test_the_ablations_rows_run_as_their_files_say(weights: str, tmp_path: Path) -> None:
+def test_the_ablations_rows_run_as_their_files_say(
+    fork_server: ForkServerContext, weights: str, tmp_path: Path
+) -> None:
     catalogue = Catalogue.with_own()
     small = ["captures.frames=10", "captures.render_size=32", "rules.image_size=32"]
     scoring = ["scoring.dists=false", "scoring.lpips=[]", "columns=[psnr]", "rules.views=[6]"]

@@ -1,6 +1,7 @@
 """What is timed against each other computes the same, but for precision."""
 
 import copy
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -8,6 +9,7 @@ import torch
 from diffusers.models.attention_processor import Attention
 from torch import nn
 
+from benchmarks.perf import diffusion_case
 from benchmarks.perf.diffusion_case import (
     batch_of,
     configuration,
@@ -22,6 +24,14 @@ from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.views import PairBatch
 
 _CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _small() -> Iterator[None]:
+    """Views of 64 pixels."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(diffusion_case, "IMAGE_SIZE", 64)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from multiprocessing.context import ForkServerContext
 from pathlib import Path
 
 import pytest
@@ -115,7 +116,9 @@ def test_a_split_that_is_missing_and_a_wrong_root_are_named(root: Path) -> None:
         open_captures(_captures(root / "34_1479_4753"), [])
 
 
-def test_the_table_runs_with_published_numbers_beside_it(root: Path, tmp_path: Path) -> None:
+def test_the_table_runs_with_published_numbers_beside_it(
+    fork_server: ForkServerContext, root: Path, tmp_path: Path
+) -> None:
     catalogue = Catalogue.with_own()
     words = [f"rules.image_size={_SIZE}", "rules.views=[3]", "methods=[nearest,inpainted]"]
     table = catalogue.table("reconfusion", [f"captures.root={root}", f"output={tmp_path}", *words])

@@ -3,15 +3,17 @@
 import hashlib
 import json
 import os
+import shutil
 import signal
-import subprocess
 import sys
 import time
+from multiprocessing.context import ForkServerContext
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
+from benchmarks.__main__ import main
 from benchmarks.catalogue import Catalogue
 from benchmarks.report.aggregate import read_results
 from benchmarks.report.verify import verify
@@ -21,94 +23,6 @@ from benchmarks.run_table import RunOptions, run_table
 from tests.benchmarks.rogues import ENDS, HANGS, LEFTOVERS, SOUND, STATE, write_rogues
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="asks /proc for processes")
-
-
-@pytest.fixture(scope="module")
-def rogues(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_rogues(tmp_path_factory.mktemp("rogues"))
-
-
-def _run(rogues: Path, output: Path, names: list[str], *words: str) -> dict[str, Cell]:
-    """The rows of a table of some rogues and two methods that do no harm."""
-    catalogue = Catalogue.with_own([str(rogues)])
-    methods = ",".join([*names, "honest", "inpainted"])
-    overrides = [f"output={output}", f"methods=[{methods}]", *words]
-    before = _sleepers()
-    run_table(catalogue.table("rogues", overrides), catalogue, RunOptions(workers=2))
-    assert _sleepers() <= before
-    folder = TableFolder(output / "rogues")
-    assert verify(folder).problems == []
-    for name in ("rogues.csv", "rogues.md", "rogues.tex", "index.html"):
-        assert (folder.path / name).stat().st_size > 100
-    return {cell.method: cell for cell in read_results(folder).cells}
-
-
-def _sleepers() -> set[int]:
-    """Processes that rogues leave behind."""
-    found = set()
-    for entry in Path("/proc").glob("[0-9]*"):
-        try:
-            if b"sleep\0" + b"3000" in (entry / "cmdline").read_bytes():
-                found.add(int(entry.name))
-        except OSError:
-            continue
-    return found
-
-
-@pytest.fixture(scope="module")
-def honest(rogues: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Cell]:
-    """The honest rows of a table without any rogue."""
-    return _run(rogues, tmp_path_factory.mktemp("honest"), [])
-
-
-def _require_rows(
-    cells: dict[str, Cell], honest: dict[str, Cell], failed: dict[str, str], ok: list[str]
-) -> None:
-    for name in ("honest", "inpainted"):
-        assert cells[name].status == "ok"
-        assert cells[name].images == honest[name].images, name
-        assert cells[name].metrics == honest[name].metrics, name
-    states = {name: (cells[name].status, cells[name].reason) for name in (*failed, *ok)}
-    wrong = {name: state for name, state in states.items() if name in ok and state != ("ok", "")}
-    wrong |= {
-        name: state
-        for name, state in states.items()
-        if name in failed and (state[0] != "failed" or failed[name] not in state[1])
-    }
-    assert not wrong
-    assert all(cell.reason.isprintable() for cell in cells.values())
-
-
-def test_a_rogue_is_a_row_and_the_others_are_as_without_it(
-    rogues: Path, honest: dict[str, Cell], tmp_path: Path
-) -> None:
-    """The gravest of those below."""
-    ends = ["exit", "kill", "bad_text", "forged", "seconds_nan", "seconds_negative"]
-    ends += ["count_float32"]
-    ok = ["default_dtype", "chdir", "thread", "orphan", "interrupts_parent"]
-    cells = _run(rogues, tmp_path, [*ends, *ok])
-    _require_rows(cells, honest, {name: ENDS[name][1] for name in ends}, ok)
-
-
-@pytest.mark.slow
-def test_every_rogue_that_ends_is_a_row(
-    rogues: Path, honest: dict[str, Cell], tmp_path: Path
-) -> None:
-    ok = [*STATE, *LEFTOVERS, *SOUND]
-    assert len(ok) + len(ENDS) + len(HANGS) >= 72
-    outside = {path: path.stat().st_mtime_ns for path in Path.cwd().iterdir()}
-    cells = _run(rogues, tmp_path / "out", [*ENDS, *ok])
-    _require_rows(cells, honest, {name: reason for name, (_, reason) in ENDS.items()}, ok)
-    assert {path: path.stat().st_mtime_ns for path in Path.cwd().iterdir()} == outside
-    assert {path.name for path in tmp_path.iterdir()} == {"out"}
-
-
-@pytest.mark.slow
-def test_a_rogue_that_never_ends_is_ended(
-    rogues: Path, honest: dict[str, Cell], tmp_path: Path
-) -> None:
-    cells = _run(rogues, tmp_path, [*HANGS], "cell_timeout_s=40")
-    _require_rows(cells, honest, dict.fromkeys(HANGS, "longer than 40 s"), [])
 
 
 _SEARCH = """
@@ -153,21 +67,117 @@ class Search:
 """
 
 
-def test_no_truth_is_in_a_methods_reach(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def rogues(fork_server: ForkServerContext, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = write_rogues(tmp_path_factory.mktemp("rogues"))
+    (folder / "search_method.py").write_text(_SEARCH)
+    (folder / "method" / "search.yaml").write_text("factory: search_method.Search\noptions: {}\n")
+    return folder
+
+
+def _run(
+    rogues: Path, output: Path, names: list[str], *words: str, workers: int = 1
+) -> dict[str, Cell]:
+    """The rows of a table of some rogues and two methods that do no harm."""
+    catalogue = Catalogue.with_own([str(rogues)])
+    methods = ",".join([*names, "honest", "inpainted"])
+    overrides = [f"output={output}", f"methods=[{methods}]", *words]
+    before = _sleepers()
+    run_table(catalogue.table("rogues", overrides), catalogue, RunOptions(workers=workers))
+    assert _sleepers() <= before
+    folder = TableFolder(output / "rogues")
+    assert verify(folder).problems == []
+    for name in ("rogues.csv", "rogues.md", "rogues.tex", "index.html"):
+        assert (folder.path / name).stat().st_size > 100
+    return {cell.method: cell for cell in read_results(folder).cells}
+
+
+def _sleepers() -> set[int]:
+    """Processes that rogues leave behind."""
+    found = set()
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            if b"sleep\0" + b"3000" in (entry / "cmdline").read_bytes():
+                found.add(int(entry.name))
+        except OSError:
+            continue
+    return found
+
+
+@pytest.fixture(scope="module")
+def honest_output(rogues: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The results of a table without any rogue."""
+    output = tmp_path_factory.mktemp("honest")
+    _run(rogues, output, [])
+    return output
+
+
+@pytest.fixture(scope="module")
+def honest(honest_output: Path) -> dict[str, Cell]:
+    cells = read_results(TableFolder(honest_output / "rogues")).cells
+    return {cell.method: cell for cell in cells}
+
+
+def _require_rows(
+    cells: dict[str, Cell], honest: dict[str, Cell], failed: dict[str, str], ok: list[str]
+) -> None:
+    for name in ("honest", "inpainted"):
+        assert cells[name].status == "ok"
+        assert cells[name].images == honest[name].images, name
+        assert cells[name].metrics == honest[name].metrics, name
+    states = {name: (cells[name].status, cells[name].reason) for name in (*failed, *ok)}
+    wrong = {name: state for name, state in states.items() if name in ok and state != ("ok", "")}
+    wrong |= {
+        name: state
+        for name, state in states.items()
+        if name in failed and (state[0] != "failed" or failed[name] not in state[1])
+    }
+    assert not wrong
+    assert all(cell.reason.isprintable() for cell in cells.values())
+
+
+def test_a_rogue_is_a_row_and_the_others_are_as_without_it(
+    rogues: Path, honest: dict[str, Cell], tmp_path: Path
+) -> None:
+    """The gravest of those below."""
+    ends = ["exit", "kill", "bad_text", "forged", "seconds_nan", "seconds_negative"]
+    ends += ["count_float32"]
+    ok = ["default_dtype", "chdir", "thread", "orphan", "interrupts_parent"]
+    cells = _run(rogues, tmp_path, [*ends, *ok])
+    _require_rows(cells, honest, {name: ENDS[name][1] for name in ends}, ok)
+
+
+@pytest.mark.slow
+def test_every_rogue_that_ends_is_a_row(
+    rogues: Path, honest: dict[str, Cell], tmp_path: Path
+) -> None:
+    ok = [*STATE, *LEFTOVERS, *SOUND]
+    assert len(ok) + len(ENDS) + len(HANGS) >= 72
+    outside = {path: path.stat().st_mtime_ns for path in Path.cwd().iterdir()}
+    cells = _run(rogues, tmp_path / "out", [*ENDS, *ok], workers=2)
+    _require_rows(cells, honest, {name: reason for name, (_, reason) in ENDS.items()}, ok)
+    assert {path: path.stat().st_mtime_ns for path in Path.cwd().iterdir()} == outside
+    assert {path.name for path in tmp_path.iterdir()} == {"out"}
+
+
+@pytest.mark.slow
+def test_a_rogue_that_never_ends_is_ended(
+    rogues: Path, honest: dict[str, Cell], tmp_path: Path
+) -> None:
+    cells = _run(rogues, tmp_path, [*HANGS], "cell_timeout_s=40", workers=2)
+    _require_rows(cells, honest, dict.fromkeys(HANGS, "longer than 40 s"), [])
+
+
+def test_no_truth_is_in_a_methods_reach(rogues: Path, honest_output: Path, tmp_path: Path) -> None:
     """One that reads all files of the results, its own memory and the frames that called it; also
     in a folder with the truths of an earlier run.
     """
-    own = write_rogues(tmp_path / "own")
-    (own / "search_method.py").write_text(_SEARCH)
-    output = tmp_path / "out"
-    text = f"factory: search_method.Search\noptions: {{root: {output}}}\n"
-    (own / "method" / "search.yaml").write_text(text)
-    _run(own, output, [])
+    output = Path(shutil.copytree(honest_output, tmp_path / "out"))
     scene = json.loads(next(output.glob("rogues/scenes/*/scene.json")).read_text())
     truth = {d for name, d in scene["files"].items() if not name.startswith("inputs/")}
     kept = {hashlib.sha256(f.read_bytes()).hexdigest() for f in output.rglob("truths/**/*.*")}
     assert truth <= kept
-    cell = _run(own, output, ["search"])["search"]
+    cell = _run(rogues, output, ["search"], f"options.search.root={output}")["search"]
     assert cell.status == "ok", cell.reason
     assert cell.truths_apart
     read = set(cell.given["digests"].split())
@@ -181,28 +191,41 @@ def test_no_truth_is_in_a_methods_reach(tmp_path: Path) -> None:
     [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)],
 )
 def test_an_interrupted_run_ends_at_once_and_goes_on_later(
-    number: signal.Signals, status: int, rogues: Path, tmp_path: Path
+    number: signal.Signals,
+    status: int,
+    fork_server: ForkServerContext,
+    rogues: Path,
+    tmp_path: Path,
 ) -> None:
     """The run alone is told, while a method hangs that hears nothing."""
     words = ["run", "rogues", f"output={tmp_path}", "--config-dir", str(rogues), "--workers", "1"]
-    command = [sys.executable, "-m", "benchmarks", *words, "methods=[honest,deaf]"]
     before = _children_of_init()
-    run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    log = tmp_path / "log.txt"
+    run = fork_server.Process(target=_run_command, args=([*words, "methods=[honest,deaf]"], log))
+    run.start()
     ends = time.monotonic() + 300
     while not list(tmp_path.glob("rogues/cells/*/cell.json")):
-        assert run.poll() is None
+        assert run.is_alive()
         assert time.monotonic() < ends
         time.sleep(0.05)
     time.sleep(0.5)
     os.kill(run.pid, number)
-    out, err = run.communicate(timeout=120)
-    assert run.returncode == status, out + err
-    assert "Traceback" not in out + err
-    assert "1 of 2 cells are kept" in err.splitlines()[-1]
+    run.join(timeout=120)
+    said = log.read_text()
+    assert run.exitcode == status, said
+    assert "Traceback" not in said
+    assert "1 of 2 cells are kept" in said.splitlines()[-1]
     assert _children_of_init() <= before
     assert list(tmp_path.glob("rogues/truths/*/truth/0.png"))
     frame = pd.read_json(next(tmp_path.glob("rogues/cells/*/cell.json")), typ="series")
     assert frame["status"] == "made"
+
+
+def _run_command(words: list[str], log: Path) -> None:
+    with log.open("wb") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    sys.exit(main(words))
 
 
 def _children_of_init() -> set[int]:

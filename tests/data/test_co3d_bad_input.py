@@ -9,8 +9,8 @@ import pytest
 from captures import frame_entries, replace_frame_entries, write_capture
 from PIL import Image
 
+from extrap_train.data import json_files
 from extrap_train.data.co3d import read_category, read_sequence
-from extrap_train.data.json_files import GZIP_FLOOR_BYTES
 from extrap_train.errors import InputError
 
 ANNOTATIONS = "frame_annotations.jgz"
@@ -91,8 +91,9 @@ def test_annotations_that_are_not_json(root, content):
     assert f"{ANNOTATIONS}: is not valid JSON" in complaint(read_category, root, "cup")
 
 
-def test_gzip_bomb(root):
-    bomb = gzip.compress(b"[" + b" " * (2 * GZIP_FLOOR_BYTES))
+def test_gzip_bomb(root, monkeypatch):
+    monkeypatch.setattr(json_files, "GZIP_FLOOR_BYTES", 1 << 20)
+    bomb = gzip.compress(b"[" + b" " * (2 << 20))
     (root / "cup" / ANNOTATIONS).write_bytes(bomb)
     assert "holds more than" in complaint(read_category, root, "cup")
 

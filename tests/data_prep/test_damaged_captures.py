@@ -2,9 +2,8 @@
 
 import logging
 import shutil
-import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +12,9 @@ import torch
 from captures import frame_entries, replace_frame_entries, write_capture
 from orbits import capture, even, ring
 
+from data_prep.__main__ import main as prepare
 from data_prep.category_pairs import prepare_category
+from extrap_train.__main__ import main as train
 from extrap_train.config import (
     Co3dConfig,
     DatasetDepthConfig,
@@ -202,10 +203,15 @@ def test_a_sequence_without_depth_is_not_sent_where_it_comes_from(
 
 
 @pytest.mark.parametrize(
-    ("module", "alone"), [("data_prep", "workers"), ("extrap_train", "threads")]
+    ("main", "alone"), [(prepare, "workers"), (train, "threads")], ids=["data_prep", "extrap_train"]
 )
 def test_the_command_line_says_what_it_leaves_out(
-    module: str, alone: str, photographs: Path, tmp_path: Path
+    main: Callable[[], None],
+    alone: str,
+    photographs: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     for name in NAMES:
         shutil.rmtree(photographs / "cup" / name / "depths")
@@ -215,10 +221,12 @@ def test_the_command_line_says_what_it_leaves_out(
         f"data.root={photographs}",
         f"output={tmp_path / 'out'}",
     ]
-    command = [sys.executable, "-m", module, *options, f"{alone}=1", "prep.max_gap_deg=10"]
-    run = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert run.returncode == 1
-    lines = [line for part in run.stderr.splitlines() for line in part.split("\r") if line.strip()]
+    monkeypatch.setattr(sys, "argv", ["", *options, f"{alone}=1", "prep.max_gap_deg=10"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 1
+    said = capsys.readouterr().err
+    lines = [line for part in said.splitlines() for line in part.split("\r") if line.strip()]
     said = [line for line in lines if not line.startswith("preparing:")]
     assert said[0].startswith("no sequence is a full circle (azimuth gap 30° > 10°)")
     for line, name in zip(said[1:-1], sorted(NAMES), strict=True):

@@ -211,8 +211,9 @@ def _adapted(model: ExtrapolationModel, options: LoraConfig, seconds: float = 1e
 
 
 def test_adapting_learns_the_scene_repeatably_and_keeps_the_best(config: ModelConfig) -> None:
-    model, done = _adapt(config, steps=40, learning_rate=3e-3, patience=100)
-    again, done_again = _adapt(config, steps=40, learning_rate=3e-3, patience=100)
+    options = {"steps": 8, "learning_rate": 3e-3, "patience": 100, "virtual_references": 2}
+    model, done = _adapt(config, **options)
+    again, done_again = _adapt(config, **options)
     assert done.losses == done_again.losses
     for one, other in zip(model.parameters(), again.parameters(), strict=True):
         assert torch.equal(one, other)
@@ -244,12 +245,13 @@ def test_it_ends_where_the_held_out_pair_gains_no_more_and_keeps_the_best_step(
     config: ModelConfig,
 ) -> None:
     """Not the last: its weights are those of a training that ended where the best was."""
-    model, done = _adapt(config, steps=400, learning_rate=30.0, patience=2)
+    options = {"learning_rate": 30.0, "patience": 2, "virtual_references": 2}
+    model, done = _adapt(config, steps=400, **options)
     losses = dict(done.losses)
     assert done.ended == "held-out pair"
     assert 0 < done.best_step == min(losses, key=losses.__getitem__)
     assert done.steps == done.best_step + 2 * OPTIONS.validate_every
-    shorter, ended_there = _adapt(config, steps=done.best_step, learning_rate=30.0, patience=2)
+    shorter, ended_there = _adapt(config, steps=done.best_step, **options)
     assert ended_there.best_step == ended_there.steps == done.best_step
     for name, kept in _adapter_of(model).items():
         assert torch.equal(kept, _adapter_of(shorter)[name]), name
@@ -271,11 +273,12 @@ def test_it_ends_where_the_time_is_up(config: ModelConfig) -> None:
     assert timed.steps < 400
 
 
-@pytest.mark.parametrize(("steps", "every"), [(6, 4), (5, 25), (7, 3), (1, 2)])
+@pytest.mark.parametrize(("steps", "every"), [(5, 25), (7, 3)])
 def test_the_last_step_is_measured_and_can_be_kept(
     config: ModelConfig, steps: int, every: int
 ) -> None:
-    _, done = _adapt(config, steps=steps, validate_every=every, learning_rate=3e-3, patience=100)
+    rate = {"learning_rate": 3e-3, "patience": 100, "virtual_references": 2}
+    _, done = _adapt(config, steps=steps, validate_every=every, **rate)
     assert done.losses[-1][0] == done.steps == steps
     assert done.best_step == min(done.losses, key=lambda found: found[1])[0]
     assert done.ended == "steps"

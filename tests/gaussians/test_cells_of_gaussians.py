@@ -1,6 +1,7 @@
 """Gaussian methods through the runner: trouble inside one is a cell with its reason."""
 
 import json
+from multiprocessing.context import ForkServerContext
 from pathlib import Path
 
 import pandas as pd
@@ -31,7 +32,7 @@ _METHODS = {
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def results(fork_server: ForkServerContext, tmp_path_factory: pytest.TempPathFactory) -> Path:
     own, output = tmp_path_factory.mktemp("own"), tmp_path_factory.mktemp("results")
     for kind in ("method", "table"):
         (own / kind).mkdir()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from extrap_train.gaussians.init import projection_matrices, triangulate, triangulate_points
+from extrap_train.gaussians.init import Points, projection_matrices, triangulate, triangulate_points
 from extrap_train.geometry.cameras import project
 from extrap_train.views import View
 from tests.scenes import orbit_camera as analytic_camera
@@ -17,8 +17,12 @@ def views() -> list[View]:
     return [render(scene, orbit_camera(azimuth, 160)) for azimuth in (0.0, 10.0, 20.0)]
 
 
-def test_points_lie_on_the_surface(views):
-    points = triangulate_points(views)
+@pytest.fixture(scope="module")
+def points(views: list[View]) -> Points:
+    return triangulate_points(views)
+
+
+def test_points_lie_on_the_surface(views, points):
     assert len(points) > 60
     pixels, depth = project(points.positions, views[1].camera)
     column, row = pixels.long().clamp(0, 159).unbind(-1)
@@ -28,8 +32,7 @@ def test_points_lie_on_the_surface(views):
     assert ((depth / truth - 1).abs() < 0.05).float().mean() > 0.9
 
 
-def test_points_have_the_colour_of_their_pixels(views):
-    points = triangulate_points(views)
+def test_points_have_the_colour_of_their_pixels(views, points):
     pixels, _ = project(points.positions, views[0].camera)
     column, row = pixels.long().clamp(0, 159).unbind(-1)
     seen = views[0].image[:, row, column].T

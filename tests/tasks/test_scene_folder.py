@@ -12,7 +12,7 @@ from filelock import FileLock
 from extrap_train.diffusion.checkpoint import load_model, save_model
 from extrap_train.tasks import scene
 
-_SHORT = ["minutes=0.2", "lora.steps=2", "lora.validate_every=2", "lora.batch_size=2"]
+_SHORT = ["minutes=0.2", "lora.steps=1", "lora.validate_every=1", "sampler.steps=1"]
 
 
 def _rank(folder: Path) -> int:

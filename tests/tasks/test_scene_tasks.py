@@ -188,7 +188,7 @@ def test_a_damaged_adapter_is_made_again_and_one_of_other_weights_is_kept(
     """Weights of the same name that were trained for longer are other weights."""
     folder, model = tmp_path / "scene" / "hydrant-0000", tmp_path / "model"
     shutil.copytree(weights, model)
-    options = ["minutes=0.2", "lora.steps=2", "lora.validate_every=2", "lora.batch_size=2"]
+    options = ["minutes=0.2", "lora.steps=1", "lora.validate_every=1", "sampler.steps=1"]
     asked = ["task=scene", f"weights={model}", *options]
 
     def is_made() -> bool:

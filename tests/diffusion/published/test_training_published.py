@@ -110,6 +110,7 @@ def test_the_task_trains_a_tiny_one_with_average_and_warm_up(
         "validation.examples=1",
         "sampler.steps=1",
         "sampler.guidance=1",
+        "threads=1",
         f"output={tmp_path}",
     ]
     run = tmp_path / "train" / "hydrant" / "zeronvs" / "latest"
