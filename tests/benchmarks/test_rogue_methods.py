@@ -225,6 +225,7 @@ def _run_command(words: list[str], log: Path) -> None:
     with log.open("wb") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in a shell's background
     sys.exit(main(words))
 
 

@@ -36,19 +36,20 @@ def references(shared: Path, seeded: Weights) -> dict[str, Reference]:
     return made
 
 
-@pytest.fixture(params=FAMILIES)
+@pytest.fixture(scope="session", params=FAMILIES)
 def reference(request: pytest.FixtureRequest, references: dict[str, Reference]) -> Reference:
     return references[request.param]
 
 
-@pytest.fixture
-def checkpoint(reference: Reference, tmp_path: Path) -> Path:
+@pytest.fixture(scope="session")
+def checkpoint(reference: Reference, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The file that a user downloads: Lightning's `.ckpt`, or accelerate's folder."""
+    parent = tmp_path_factory.mktemp(reference.family)
     if reference.family == "zeronvs":
-        path = tmp_path / "zeronvs.ckpt"
+        path = parent / "zeronvs.ckpt"
         torch.save({"state_dict": reference.state, "global_step": 7}, path)
         return path
-    folder = tmp_path / "iter_7"
+    folder = parent / "iter_7"
     folder.mkdir()
     torch.save(reference.state, folder / "pytorch_model.bin")
     return folder

@@ -25,7 +25,7 @@ def assert_parity(ours: Tensor, expected: Tensor) -> None:
     assert float((ours - expected).abs().max()) <= 1e-4 * float(expected.std())
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def model(reference: Reference, checkpoint: Path) -> ExtrapolationModel:
     config = tiny_config(reference.family, start=str(checkpoint))
     return initial_model(config).eval()
@@ -78,7 +78,7 @@ def test_nine_steps_as_published(model: ExtrapolationModel, reference: Reference
         model.null,
     )
     visited = []
-    model.unet.register_forward_pre_hook(lambda _, given_to: visited.append(int(given_to[1][0])))
+    hook = model.unet.register_forward_pre_hook(lambda _, step: visited.append(int(step[1][0])))
     options = SamplerConfig(steps=10, eta=0.0, guidance=3.0, compat="megascenes")
     with torch.no_grad():
         latent = sample_ddim(
@@ -88,6 +88,7 @@ def test_nine_steps_as_published(model: ExtrapolationModel, reference: Reference
             options.eta,
             lambda: given["ddim_noise"],
         )
+    hook.remove()
     assert sorted(visited) == sorted(given["ddim_timesteps"].tolist())
     assert_parity(latent, given["ddim_latent"])
 

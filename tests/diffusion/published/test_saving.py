@@ -31,10 +31,13 @@ def test_plain_diffusers_loads_it_and_so_do_we(
     )
     for part, network in model.parts().items():
         copies = [again.parts()[part], started.parts()[part], outside.get(part, network)]
-        for copy in copies:
-            assert copy.state_dict().keys() == network.state_dict().keys()
-            for name, value in network.state_dict().items():
-                assert torch.equal(copy.state_dict()[name], value), name
+        expected = network.state_dict()
+        for state in (copy.state_dict() for copy in copies):
+            assert state.keys() == expected.keys()
+            unlike = [
+                name for name, value in expected.items() if not torch.equal(state[name], value)
+            ]
+            assert not unlike
     schedule = DDIMScheduler.from_pretrained(tmp_path / "model" / "scheduler")
     assert float(schedule.alphas_cumprod[999]) == pytest.approx(0.00466, abs=1e-5)
     assert again.config == config
