@@ -11,7 +11,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from tests.benchmarks.tables import write_own
+from tests.benchmarks.tables import run_greys, write_own
 
 
 def _command(own: Path, output: Path, methods: str) -> list[str]:
@@ -28,11 +28,12 @@ def _table(output: Path) -> pd.DataFrame:
     return table[~table["metric"].isin(["seconds", "peak_memory_mib"])].reset_index(drop=True)
 
 
-def test_a_worker_that_is_killed_is_a_failed_cell_and_the_rest_goes_on(tmp_path: Path) -> None:
-    own = write_own(tmp_path / "own")
-    result = _run(own, tmp_path / "out", "dark,killer,light")
-    assert result.returncode == 1, result.stdout + result.stderr
-    table = _table(tmp_path / "out")
+def test_a_worker_that_is_killed_is_a_failed_cell_and_the_rest_goes_on(
+    own: Path, tmp_path: Path
+) -> None:
+    failed = run_greys(own, tmp_path, "methods=[dark,killer,light]", workers=2)
+    assert failed == 2  # captures
+    table = _table(tmp_path)
     states = table.groupby("method")["status"].first()
     assert dict(states) == {"dark": "ok", "killer": "failed", "light": "ok"}
     reasons = table[table["method"] == "killer"]["reason"]
