@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import time
 from multiprocessing.context import ForkServerContext
@@ -13,7 +14,6 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from benchmarks.__main__ import main
 from benchmarks.catalogue import Catalogue
 from benchmarks.report.aggregate import read_results
 from benchmarks.report.verify import verify
@@ -191,42 +191,28 @@ def test_no_truth_is_in_a_methods_reach(rogues: Path, honest_output: Path, tmp_p
     [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)],
 )
 def test_an_interrupted_run_ends_at_once_and_goes_on_later(
-    number: signal.Signals,
-    status: int,
-    fork_server: ForkServerContext,
-    rogues: Path,
-    tmp_path: Path,
+    number: signal.Signals, status: int, rogues: Path, tmp_path: Path
 ) -> None:
     """The run alone is told, while a method hangs that hears nothing."""
     words = ["run", "rogues", f"output={tmp_path}", "--config-dir", str(rogues), "--workers", "1"]
+    command = [sys.executable, "-m", "benchmarks", *words, "methods=[honest,deaf]"]
     before = _children_of_init()
-    log = tmp_path / "log.txt"
-    run = fork_server.Process(target=_run_command, args=([*words, "methods=[honest,deaf]"], log))
-    run.start()
+    run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     ends = time.monotonic() + 300
     while not list(tmp_path.glob("rogues/cells/*/cell.json")):
-        assert run.is_alive()
+        assert run.poll() is None
         assert time.monotonic() < ends
         time.sleep(0.05)
     time.sleep(0.5)
     os.kill(run.pid, number)
-    run.join(timeout=120)
-    said = log.read_text()
-    assert run.exitcode == status, said
-    assert "Traceback" not in said
-    assert "1 of 2 cells are kept" in said.splitlines()[-1]
+    out, err = run.communicate(timeout=120)
+    assert run.returncode == status, out + err
+    assert "Traceback" not in out + err
+    assert "1 of 2 cells are kept" in err.splitlines()[-1]
     assert _children_of_init() <= before
     assert list(tmp_path.glob("rogues/truths/*/truth/0.png"))
     frame = pd.read_json(next(tmp_path.glob("rogues/cells/*/cell.json")), typ="series")
     assert frame["status"] == "made"
-
-
-def _run_command(words: list[str], log: Path) -> None:
-    with log.open("wb") as file:
-        os.dup2(file.fileno(), 1)
-        os.dup2(file.fileno(), 2)
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in a shell's background
-    sys.exit(main(words))
 
 
 def _children_of_init() -> set[int]:
