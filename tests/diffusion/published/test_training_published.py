@@ -101,7 +101,6 @@ def test_the_task_trains_a_tiny_one_with_average_and_warm_up(
         "data.frames=12",
         "data.image_size=32",
         "prep.max_gap_deg=60",
-        "prep.image_size=256",
         "prep.correct=false",
         "prep.max_uses=1",
         "trainer.batch_size=1",
