@@ -4,10 +4,10 @@ from pathlib import Path
 
 from benchmarks.catalogue import Catalogue
 from benchmarks.report.aggregate import Results
+from benchmarks.report.formats import latex, markdown, numbers, tables
 from benchmarks.report.page import page
 from benchmarks.report.plots import plots
 from benchmarks.report.table_layout import Layout, lay_out
-from benchmarks.report.text import latex, markdown, numbers, tables
 from benchmarks.run.plan import TableFolder
 from extrap_train.store.atomic import write_atomic
 

@@ -69,9 +69,19 @@ class Panel:
     columns: list[tuple[str, int]]
     rows: list[Row]
 
+    @property
+    def metrics(self) -> list[str]:
+        """Every metric once, each over all numbers of `views`."""
+        return list(dict.fromkeys(metric for metric, _ in self.columns))
+
+    @property
+    def views(self) -> list[int]:
+        """Every number of views once."""
+        return list(dict.fromkeys(n for _, n in self.columns))
+
     def headings(self) -> list[str]:
         """Metric with its arrow and the number of views, per column."""
-        return [f"{name_of(m)} {_ARROWS[metric_direction(m)]} {n} views" for m, n in self.columns]
+        return [f"{heading_of(metric)} {n} views" for metric, n in self.columns]
 
 
 @dataclass(frozen=True)
@@ -85,6 +95,16 @@ class Layout:
     missing: list[str]
     """Empty numbers and the cells that have none, with their reasons."""
     notes: list[str]
+
+    def in_order(self) -> list[Panel]:
+        """The panel over everything, the published numbers, and the rest."""
+        reported = [self.reported] if self.reported else []
+        return [*self.panels[:1], *reported, *self.panels[1:]]
+
+
+def heading_of(metric: str) -> str:
+    """A metric's name with an arrow to its better side."""
+    return f"{name_of(metric)} {_ARROWS[metric_direction(metric)]}"
 
 
 def name_of(metric: str) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 from benchmarks.protocol.draws import Draw, Protocol
 from benchmarks.protocol.prepared_scene import Scene
 from benchmarks.report.aggregate import UNIT, Results, read_results
-from benchmarks.report.text import tables
+from benchmarks.report.formats import tables
 from benchmarks.run.cell_record import OK, Cell, files_of
 from benchmarks.run.identity import cell_key, image_options, judged_columns, scores_manifest
 from benchmarks.run.plan import TableFolder, selected_draws
