@@ -6,7 +6,6 @@ that a sweep that is killed has the rows of what it finished, and a job that fai
 another: Hydra goes on with the others and ends with that job's error. A folder holds one sweep.
 """
 
-import csv
 import io
 import math
 import sys
@@ -16,6 +15,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from filelock import FileLock
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
@@ -29,7 +29,6 @@ from extrap_train.store.atomic import file_lock, remove_leftovers, write_atomic
 from extrap_train.store.cache import require_same
 from extrap_train.store.manifest import MANIFEST, Manifest
 from extrap_train.store.records import write_record
-from extrap_train.sweep_seeds import over_seeds
 
 Row = dict[str, str]
 METRIC = "result."
@@ -94,9 +93,8 @@ class SweepTable(Callback):
             rows = add_row(folder / _TABLE, row)
             draw(rows, folder / "sweep.png")
             compare_over_seeds(rows, folder / "seeds.md")
-        numbers = [
-            f"{name.removeprefix(METRIC)} {float(row[name]):.4g}" for name in _shown_metrics([row])
-        ]
+        metrics = _shown_metrics(pd.DataFrame([row]))
+        numbers = [f"{_metric_name(name)} {float(row[name]):.4g}" for name in metrics]
         said = ", ".join(numbers) or row["reason"]
         print(f"job {row['job']}: {row['status']} {said}".rstrip())
         print(f"sweep: {folder / _TABLE}", flush=True)
@@ -146,7 +144,7 @@ def _give_objective(job: JobReturn, row: Row, objective: str) -> None:
     if found is not None:
         job.return_value = float(found)
         return
-    known = [name.removeprefix(METRIC) for name in row if name.startswith(METRIC)]
+    known = [_metric_name(name) for name in row if name.startswith(METRIC)]
     job.status = JobStatus.FAILED
     error = InputError(
         f"hydra.callbacks.sweep_table.objective={objective}: the job has no such metric; "
@@ -175,52 +173,45 @@ def _numbers(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, float
     return found
 
 
-def add_row(file: Path, row: Row) -> list[Row]:
-    """All rows by their job's number, the new one among them, written at once.
+def add_row(file: Path, row: Row) -> pd.DataFrame:
+    """All rows as texts, sorted by job number, with the new one among them; written at once.
 
-    Columns are those of any row: an empty one says that this job did not have it.
+    Columns are those of any row: an empty cell means that the job did not have it.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
     with FileLock(file.with_suffix(".lock")):  # a launcher may run jobs side by side
-        rows = [r for r in read_rows(file) if r["job"] != row["job"]]
-        rows = sorted([*rows, row], key=lambda r: int(r["job"]))
-        names = [name for r in rows for name in r if name not in _NO_OPTIONS]
-        text = io.StringIO()
-        table = csv.DictWriter(text, [*_HEAD, *dict.fromkeys(names), *_TAIL], restval="")
-        table.writeheader()
-        table.writerows(rows)
-        write_atomic(file, text.getvalue().encode())
+        rows = read_rows(file)
+        rows = pd.concat([rows[rows["job"] != row["job"]], pd.DataFrame([row])]).fillna("")
+        rows = rows.sort_values("job", key=lambda job: job.astype(int), ignore_index=True)
+        between = [name for name in rows if name not in _NO_OPTIONS]
+        rows = rows[[*_HEAD, *between, *_TAIL]]
+        write_atomic(file, rows.to_csv(index=False).encode())
     return rows
 
 
-def read_rows(file: Path) -> list[Row]:
-    """The rows that are there, without their empty columns."""
+def read_rows(file: Path) -> pd.DataFrame:
+    """The rows that are there, as texts."""
     if not file.is_file():
-        return []
-    with file.open(newline="") as content:
-        return [
-            {k: v for k, v in row.items() if v or k in _NO_OPTIONS}
-            for row in csv.DictReader(content)
-        ]
+        return pd.DataFrame(columns=[*_HEAD, *_TAIL], dtype=str)
+    return pd.read_csv(file, dtype=str, keep_default_na=False)
 
 
-def draw(rows: list[Row], file: Path) -> None:
+def draw(rows: pd.DataFrame, file: Path) -> None:
     """One panel per metric with a bar per finished job, named by the overrides that differ."""
-    done = [row for row in rows if row["status"] in _DONE]
+    done = rows[rows["status"].isin(_DONE)]
     metrics = _shown_metrics(done)
     if not metrics:
         return
     from matplotlib.figure import Figure  # a second that a single run need not wait
 
-    labels = [_label(row, done) or f"job {row['job']}" for row in done]
+    labels = _labels(done).where(lambda label: label != "", "job " + done["job"])
     figure = Figure(
         figsize=(7, 0.6 + len(metrics) * (0.5 + 0.25 * len(done))), layout="constrained"
     )
     for axes, metric in zip(
         figure.subplots(len(metrics), squeeze=False)[:, 0], metrics, strict=True
     ):
-        values = [float(row.get(metric, math.nan)) for row in done]
-        axes.barh(range(len(done)), values, height=0.6)
+        axes.barh(range(len(done)), pd.to_numeric(done[metric]), height=0.6)
         axes.set_yticks(range(len(done)), labels, fontsize=8)
         axes.invert_yaxis()
         axes.set_title(metric, fontsize=9)
@@ -230,36 +221,79 @@ def draw(rows: list[Row], file: Path) -> None:
     write_atomic(file, content.getvalue())
 
 
-def compare_over_seeds(rows: list[Row], file: Path) -> None:
+def compare_over_seeds(rows: pd.DataFrame, file: Path) -> None:
     """The table of `over_seeds`, once a combination of overrides has run with two seeds.
 
     The first job's is what the others are compared with, also where it has failed.
     """
-    rows = [row for row in rows if "seed" in row]
-    if not rows:
+    if "seed" not in rows:
         return
-    done = [row for row in rows if row["status"] in _DONE]
-    metrics = _shown_metrics(done)
-    alike = [{**row, "seed": ""} for row in rows]
-    first = _label(alike[0], alike) or _ONLY
-    labels = [_label(row, alike) or _ONLY for row in alike if row["status"] in _DONE]
-    if len(set(labels)) == len(labels) or not metrics:
+    labels = _labels(rows.drop(columns="seed")).replace("", _ONLY)
+    done = rows["status"].isin(_DONE) & (rows["seed"] != "")
+    metrics = _shown_metrics(rows[done])
+    if labels[done].is_unique or not metrics:
         return
-    columns = {
-        m.removeprefix(METRIC): [float(row.get(m, math.nan)) for row in done] for m in metrics
+    table = rows.loc[done, metrics].apply(pd.to_numeric).rename(columns=_metric_name)
+    table.index = pd.MultiIndex.from_arrays([labels[done], rows.loc[done, "seed"]])
+    write_atomic(file, over_seeds(labels.iloc[0], table).encode())
+
+
+def over_seeds(first: str, table: pd.DataFrame) -> str:
+    """A Markdown table with one row per label, of jobs indexed by their label and seed.
+
+    Differences are taken seed by seed to the jobs labelled `first`, so that what a seed does to all
+    alike drops out, and there are none where these are missing; ± is the standard error of the mean
+    over seeds, absent where there is but one.
+    """
+    table = table[~table.index.duplicated(keep="last")]
+    by_label = {first: table[:0].droplevel(0)}
+    by_label |= {
+        str(label): jobs.droplevel(0) for label, jobs in table.groupby(level=0, sort=False)
     }
-    write_atomic(file, over_seeds(first, labels, [row["seed"] for row in done], columns).encode())
+    lines = [["", "seeds"], ["---"] * (2 + 2 * len(table.columns))]
+    for metric in table:
+        lines[0] += [str(metric), "difference"]
+    for label, jobs in by_label.items():
+        line, apart = [label, str(len(jobs))], jobs - by_label[first]
+        for metric in table:
+            form = f".{_decimals(table[metric])}f"
+            line.append(_spread(jobs[metric], form))
+            line.append("" if label == first else _spread(apart[metric], form, sign="+"))
+        lines.append(line)
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
-def _shown_metrics(rows: list[Row]) -> list[str]:
+def _spread(values: "pd.Series[float]", form: str, sign: str = "") -> str:
+    known = values.dropna()
+    if known.empty:
+        return "–"
+    error = "" if len(known) == 1 else f" ± {known.sem():{form}}"
+    return f"{known.mean():{sign}{form}}{error}"
+
+
+def _decimals(values: "pd.Series[float]") -> int:
+    """So many that the column's greatest value has four digits."""
+    greatest = values.abs().max()
+    return 3 if not greatest > 0 else max(0, 3 - math.floor(math.log10(greatest)))
+
+
+def _metric_name(column: str) -> str:
+    return column.removeprefix(METRIC)
+
+
+def _shown_metrics(rows: pd.DataFrame) -> list[str]:
     """The model's own first, then whatever else the jobs measured."""
-    names = dict.fromkeys(name for row in rows for name in row if name.startswith(METRIC))
+    names = [name for name in map(str, rows) if name.startswith(METRIC) and any(rows[name] != "")]
     rank = {f"{METRIC}validation.model.{name}": at for at, name in enumerate(_SHOWN)}
     return sorted(names, key=lambda name: rank.get(name, len(rank)))[:_PANELS]
 
 
-def _label(row: Row, rows: list[Row]) -> str:
-    """The overrides that tell the jobs apart."""
-    options = [n for n in row if n not in _NO_OPTIONS and not n.startswith(METRIC)]
-    apart = [n for n in options if len({r.get(n) for r in rows}) > 1]
-    return " ".join(f"{name}={row.get(name, '')}" for name in apart)
+def _labels(rows: pd.DataFrame) -> "pd.Series[str]":
+    """Of every row the overrides that tell the jobs apart."""
+    options = [n for n in map(str, rows) if n not in _NO_OPTIONS and not n.startswith(METRIC)]
+    apart = [name for name in options if rows[name].nunique() > 1]
+    texts = [
+        " ".join(f"{name}={value}" for name, value in zip(apart, row, strict=True) if value)
+        for row in rows[apart].itertuples(index=False, name=None)
+    ]
+    return pd.Series(texts, index=rows.index, dtype=str)

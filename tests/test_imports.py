@@ -13,7 +13,6 @@ _ORDER = (
     "extrap_train.errors",
     "extrap_train.views",
     "extrap_train.terminal",
-    "extrap_train.sweep_seeds",
     "extrap_train.store",
     "extrap_train.exits",
     "extrap_train.config",

@@ -14,8 +14,7 @@ from extrap_train.config import TrainConfig
 from extrap_train.errors import InputError
 from extrap_train.store import Outcome
 from extrap_train.store.atomic import file_lock
-from extrap_train.sweep import add_row, compare_over_seeds, read_rows
-from extrap_train.sweep_seeds import over_seeds
+from extrap_train.sweep import add_row, compare_over_seeds, over_seeds, read_rows
 
 Fake = Callable[[TrainConfig], Path | Outcome]
 
@@ -94,7 +93,8 @@ def test_seeds_are_compared_one_by_one() -> None:
     seeds = ["0", "1", "2", "1", "0", "7"]
     psnr = [20.0, 22.0, 27.0, 22.5, 20.3, 19.0]
     lpips = [0.1, 0.2, float("nan"), 0.3, 0.2, float("nan")]
-    table = over_seeds("old", labels, seeds, {"psnr": psnr, "lpips": lpips})
+    jobs = pd.DataFrame({"psnr": psnr, "lpips": lpips}, index=[labels, seeds])
+    table = over_seeds("old", jobs)
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()]
     assert rows[0] == ["", "seeds", "psnr", "difference", "lpips", "difference"]
     assert rows[2] == ["old", "3", "23.00 ± 2.08", "", "0.1500 ± 0.0500", ""]
@@ -139,8 +139,8 @@ def test_a_row_that_comes_late_or_twice_has_its_place(tmp_path: Path) -> None:
             file,
             {"job": number, "status": "ok", "seconds": "1.0", "lr": lr, "folder": "", "reason": ""},
         )
-    assert [(row["job"], row["lr"]) for row in rows] == [("2", "1"), ("10", "4")]
-    assert read_rows(file) == rows
+    assert [*zip(rows["job"], rows["lr"], strict=True)] == [("2", "1"), ("10", "4")]
+    pd.testing.assert_frame_equal(read_rows(file), rows)
 
 
 def test_a_single_run_has_no_table(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -273,7 +273,7 @@ def test_what_others_are_compared_with_does_not_change_where_it_fails(tmp_path: 
             ]
         )
     ]
-    compare_over_seeds(rows, tmp_path / "seeds.md")
+    compare_over_seeds(pd.DataFrame(rows).fillna(""), tmp_path / "seeds.md")
     lines = (tmp_path / "seeds.md").read_text().splitlines()[2:]
     table = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
     assert table == [
