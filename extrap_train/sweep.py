@@ -267,8 +267,8 @@ def _spread(values: "pd.Series[float]", form: str, sign: str = "") -> str:
     known = values.dropna()
     if known.empty:
         return "–"
-    error = "" if len(known) == 1 else f" ± {known.sem():{form}}"
-    return f"{known.mean():{sign}{form}}{error}"
+    mean = format(known.mean(), f"{sign}{form}")
+    return mean if len(known) == 1 else f"{mean} ± {format(known.sem(), form)}"
 
 
 def _decimals(values: "pd.Series[float]") -> int:

@@ -14,19 +14,29 @@ from benchmarks.methods.gaussian_method import (
     prior_depths,
 )
 from extrap_train.config.options import option
-from extrap_train.errors import InputError
 from extrap_train.gaussians.density import remove
 from extrap_train.gaussians.gaussian_model import GaussianParameters, Gaussians, sh_basis
 from extrap_train.gaussians.gaussian_options import MIN_BETWEEN_GROWTH
 from extrap_train.gaussians.init import nearest_expected
-from extrap_train.gaussians.losses import edge_aware_smoothness, fill_unknown, patch_depth_loss
-from extrap_train.gaussians.rasterize import Drawing, draw
+from extrap_train.gaussians.losses import fill_unknown, patch_depth_loss
+from extrap_train.gaussians.rasterize import draw
 from extrap_train.gaussians.recipe import Objective, Recipe, Step, Training
 from extrap_train.gaussians.training_scene import TrainingScene
 from extrap_train.views import Camera
 
-_OPAQUE = 0.2
-"""Opacities above are pulled to 1, those below, as in the released code, too."""
+_HARD_OPACITY = 0.95
+"""Of every Gaussian in hard depth steps."""
+_LOCAL_WEIGHT, _GLOBAL_WEIGHT = 0.1, 1.0
+"""Of depth normalised by the patch, and by the image."""
+_DEPTH_TOLERANCE = 0.01
+"""Smaller differences of depth are let be."""
+_SMALLEST_PATCH, _LARGEST_PATCH = 5, 17
+"""Sides in pixels; each term draws its own."""
+_COARSEST_CELLS, _FINEST_CELLS, _BOUND = 16, 512, 3.0
+"""Of the hash grid: cells along the coarsest level, cells per extent along the finest, and half the
+side of its cube in extents.
+"""
+_GRID_RATE, _NETWORK_RATE = 5e-3, 5e-4
 
 
 @dataclass(frozen=True)
@@ -35,7 +45,8 @@ class DnGaussian(GaussianMethod):
 
     Published values are those for Blender's scenes, whose cameras too stand around an object.
     Two things differ: depth steps are taken in every iteration, not every tenth, and what stands
-    right before a camera is removed as in the released training for LLFF.
+    right before a camera is removed as in the released training for LLFF. Terms that are published
+    for LLFF alone (smooth depth; round, small and opaque Gaussians) are left out.
     """
 
     full_iterations: int = 6000
@@ -52,51 +63,15 @@ class DnGaussian(GaussianMethod):
         "monocular depth: the depth source under an unknown affine map, or as it is",
         known=MONOCULAR,
     )
-    hard_opacity: float = option(0.95, "opacity in hard depth steps", low=0, high=1)
     soft_from: int = option(1000, "iteration from which opacities follow depth", low=0)
-    smooth_from: int = option(3000, "iteration from which depth is smoothed", low=0)
-    local_weight: float = option(0.1, "weight of depth normalised by the patch", low=0)
-    global_weight: float = option(1.0, "weight of depth normalised by the image", low=0)
-    smooth_weight: float = option(
-        0.0, "weight of edge-aware smoothness; published: 0.1 for LLFF, none for others", low=0
-    )
-    depth_tolerance: float = option(0.01, "smaller differences of depth are let be", low=0)
-    patch_range: tuple[int, int] = option(
-        (5, 17), "smallest and largest side of a patch; each term draws its own", unit="px", low=2
-    )
-    shape_weight: float = option(
-        0.0, "weight of round Gaussians; published: none for Blender, 0.002 for LLFF", low=0
-    )
-    scale_weight: float = option(
-        0.0, "weight of small Gaussians; published: none for Blender, 0.001 for LLFF", low=0
-    )
-    opacity_weight: float = option(
-        0.0, "weight of opacities near 0 or 1; published: none for Blender, 0.001 for LLFF", low=0
-    )
     clear_every: int = option(
         25,
         "iterations after which Gaussians right before a camera, and unseen ones, are removed: "
         "patches know no absolute depth, and a shell there satisfies them all",
         low=0,
     )
-
-    color: str = option(
-        "neural", "hash grid and networks, or spherical harmonics", known=("neural", "sh")
-    )
     hash_levels: int = option(16, "levels of the hash grid", low=2, high=32)
     hash_log2_size: int = option(19, "entries of a level's table, as a power of 2", low=1, high=30)
-    hash_coarsest: int = option(16, "cells along the coarsest level", low=1)
-    hash_finest: int = option(512, "cells per extent along the finest level", low=1)
-    hash_bound: float = option(3.0, "half the side of the grid's cube, in extents", low=0.001)
-    grid_rate: float = option(5e-3, "learning rate of the hash grid", low=0)
-    network_rate: float = option(5e-4, "learning rate of the networks", low=0)
-
-    def __post_init__(self) -> None:
-        """InputError for the first option that cannot be meant."""
-        super().__post_init__()
-        least, greatest = self.patch_range
-        if greatest < least:
-            raise InputError(f"patch_range={self.patch_range}: smallest first")
 
     def recipe(self, scene: TrainingScene) -> Recipe:
         """Three optimiser steps an iteration."""
@@ -113,20 +88,12 @@ class DnGaussianRecipe(Recipe):
         source = monocular_source(scene, options.monocular)
         priors = prior_depths(scene, source, options.device)
         self._priors = [fill_unknown(prior) for prior in priors]
-        self._neural = None
-        if options.color == "neural":
-            with torch.random.fork_rng(devices=[]):
-                torch.manual_seed(scene.seed)
-                self._neural = NeuralColor(
-                    HashGrid(
-                        options.hash_levels,
-                        options.hash_log2_size,
-                        options.hash_coarsest,
-                        round(options.hash_finest * options.hash_bound),
-                        options.hash_bound,
-                    )
-                ).to(options.device)
-        scene.record["color"] = options.color
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(scene.seed)
+            finest = round(_FINEST_CELLS * _BOUND)
+            levels, log2_size = options.hash_levels, options.hash_log2_size
+            grid = HashGrid(levels, log2_size, _COARSEST_CELLS, finest, _BOUND)
+            self._neural = NeuralColor(grid).to(options.device)
         self._nearest_expected = nearest_expected(self.cameras)
         nearest = float(self._nearest_expected.min())
         scene.record["nearest"] = f"{nearest:.2f} extents from the inputs" if nearest else "unknown"
@@ -134,19 +101,14 @@ class DnGaussianRecipe(Recipe):
 
     def modules(self) -> Sequence[tuple[nn.Module, float, float]]:
         """The grid and the networks, at rates that stay."""
-        if self._neural is None:
-            return ()
-        options, networks = self.options, nn.ModuleList()
-        networks.extend([self._neural.spatial, self._neural.directional])
+        networks = nn.ModuleList([self._neural.spatial, self._neural.directional])
         return (
-            (self._neural.grid, options.grid_rate, options.grid_rate),
-            (networks, options.network_rate, options.network_rate),
+            (self._neural.grid, _GRID_RATE, _GRID_RATE),
+            (networks, _NETWORK_RATE, _NETWORK_RATE),
         )
 
     def colors(self, parameters: GaussianParameters, camera: Camera) -> Float[Tensor, "n 3"] | None:
-        """The networks' colours, where they are asked for."""
-        if self._neural is None:
-            return None
+        """The networks' colours."""
         means = parameters.means.detach()
         directions = nn.functional.normalize(means - camera.center.detach(), dim=-1)
         return self._neural(means, directions)
@@ -158,23 +120,6 @@ class DnGaussianRecipe(Recipe):
         self._soft_steps += len(soft)
         self.scene.record["soft depth"] = f"in {self._soft_steps} iterations"
         return (self._hard_step, *soft, self.photometric_step)
-
-    def regulariser(
-        self, training: Training, index: int, drawing: Drawing
-    ) -> Float[Tensor, ""] | float:
-        """Round, small, and either opaque or not (as coded: rather opaque)."""
-        options, now = self.options, training.optimiser.parameters
-        if not (options.shape_weight or options.scale_weight or options.opacity_weight):
-            return 0.0
-        scales, opacities = now.scales, now.opacities
-        high = opacities > _OPAQUE
-        away = torch.where(high, -opacities.square(), 0).sum() / high.sum().clamp_min(1)
-        low = torch.where(high, 0, (1 - opacities).square()).sum() / (~high).sum().clamp_min(1)
-        return (
-            options.shape_weight * (scales.amax(1) / scales.amin(1)).mean()
-            + options.scale_weight * scales.amax(1).square().mean()
-            + options.opacity_weight * (1 + away + low)
-        )
 
     def adapt(self, training: Training) -> None:
         """As 3DGS; every while, nothing is left right before an input, or unseen by all of them."""
@@ -197,7 +142,7 @@ class DnGaussianRecipe(Recipe):
 
     def _hard_step(self, training: Training, index: int) -> Objective:
         now = training.optimiser.parameters.gaussians()
-        opaque = torch.full_like(now.opacities, self.options.hard_opacity)
+        opaque = torch.full_like(now.opacities, _HARD_OPACITY)
         shown = replace(now, opacities=opaque, scales=now.scales.detach(), quats=now.quats.detach())
         return Objective(self._depth_loss(training, index, shown))
 
@@ -211,8 +156,8 @@ class DnGaussianRecipe(Recipe):
     def _depth_loss(
         self, training: Training, index: int, gaussians: Gaussians
     ) -> Float[Tensor, ""]:
-        """Local and global terms, each with a patch size of its own; smoothness later."""
-        options, prior = self.options, self._priors[index]
+        """Local and global terms, each with a patch size of its own."""
+        prior = self._priors[index]
         grey = torch.full_like(gaussians.means.detach(), 0.5)
         depth = draw(
             self._rasterize, gaussians, self.camera(index), self.background, 0, grey
@@ -220,14 +165,12 @@ class DnGaussianRecipe(Recipe):
         if not (prior > 0).any():
             return depth.sum() * 0
         loss = depth.new_zeros(())
-        for local, weight in ((True, options.local_weight), (False, options.global_weight)):
-            least, greatest = options.patch_range
-            drawn = torch.randint(least, greatest + 1, (1,), generator=training.generator)
-            term = patch_depth_loss(depth, prior, int(drawn), local, options.depth_tolerance)
+        for local, weight in ((True, _LOCAL_WEIGHT), (False, _GLOBAL_WEIGHT)):
+            drawn = torch.randint(
+                _SMALLEST_PATCH, _LARGEST_PATCH + 1, (1,), generator=training.generator
+            )
+            term = patch_depth_loss(depth, prior, int(drawn), local, _DEPTH_TOLERANCE)
             loss = loss + weight * term
-        late = training.iteration > training.schedule.at(options.smooth_from)
-        if late and options.smooth_weight > 0:
-            loss = loss + options.smooth_weight * edge_aware_smoothness(depth, prior)
         return loss
 
 

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -27,8 +26,6 @@ from extrap_train.views import Camera, View
 
 NEIGHBOURS = 3
 
-Pairing = Literal["paper", "released"]
-
 
 @dataclass(frozen=True)
 class Fsgs(GaussianMethod):
@@ -45,11 +42,6 @@ class Fsgs(GaussianMethod):
         "surrogate",
         "monocular depth: the depth source under an unknown affine map, or as it is",
         known=MONOCULAR,
-    )
-    pairing: Pairing = option(
-        "paper",
-        "ends of an unpooled edge: the paper's, or those of the released code's mistake",
-        known=("paper", "released"),
     )
     unpool_until: int = option(2000, "last iteration with unpooling", low=0)
     unpool_proximity: float = option(
@@ -127,7 +119,6 @@ class FsgsRecipe(Recipe):
             training.optimiser.parameters,
             options.unpool_proximity,
             options.unpool_scale,
-            options.pairing,
             max(options.max_gaussians - count, 0),
         )
         training.optimiser.append(new)
@@ -138,7 +129,7 @@ class FsgsRecipe(Recipe):
 
 
 def unpool(
-    parameters: GaussianParameters, proximity: float, scale: float, pairing: Pairing, most: int
+    parameters: GaussianParameters, proximity: float, scale: float, most: int
 ) -> tuple[GaussianParameters, bool]:
     """The Gaussians that fill the gaps between those already there, the most isolated sources'
     first and at most `most` of them; and whether there would have been more.
@@ -146,13 +137,13 @@ def unpool(
     A Gaussian is a source where the mean squared distance to its three neighbours exceeds
     `proximity` and its largest scale `scale`. On each edge from a source to a neighbour a new one
     is put in the middle, with the neighbour's scale and opacity, no rotation, and a colour of zero.
-    `released` pairs as the published code does: sources repeat as 0 1 0 1 0 1 while neighbours
-    stand as 0 0 0 1 1 1, so that with several sources most edges lead to a stranger.
+    The released code pairs sources 0 1 0 1 0 1 with the neighbours of 0 0 0 1 1 1, so that with
+    several sources most edges lead to a stranger; this is the paper's pairing.
     """
     distance, index = nearest_neighbours(parameters.means, NEIGHBOURS)
     gap = distance.square().mean(1)
     sources = find_isolated(parameters, gap, proximity, scale)
-    source, target = edges(sources, index, pairing)
+    source, target = sources.repeat_interleave(NEIGHBOURS), index[sources].flatten()
     limited = len(source) > most
     source, target = source[:most], target[:most]
     means = parameters.means.detach()
@@ -179,17 +170,6 @@ def find_isolated(
     chosen = (gap > proximity) & (parameters.scales.detach().amax(1) > scale)
     order = gap.argsort(descending=True, stable=True)
     return order[chosen[order]]
-
-
-def edges(
-    sources: Int[Tensor, " s"], neighbours: Int[Tensor, "n k"], pairing: Pairing
-) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"]]:
-    """Both ends of every new edge, as Gaussian numbers."""
-    targets = neighbours[sources].flatten()
-    count = neighbours.shape[1]
-    if pairing == "paper":
-        return sources.repeat_interleave(count), targets
-    return sources.repeat(count), targets
 
 
 def pseudo_camera(

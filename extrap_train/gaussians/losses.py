@@ -127,18 +127,6 @@ def patch_depth_loss(
     return (difference.square() * beyond).sum() / beyond.sum().clamp_min(1)
 
 
-def edge_aware_smoothness(
-    depth: Float[Tensor, "h w"], guide: Float[Tensor, "h w"]
-) -> Float[Tensor, ""]:
-    """Mean gradient of the depth, weighted down where the guide has an edge."""
-    total, weights = depth.new_zeros(()), depth.new_zeros(())
-    for axis in (0, 1):
-        weight = torch.exp(-guide.diff(dim=axis).abs())
-        total = total + (depth.diff(dim=axis).abs() * weight).sum()
-        weights = weights + weight.sum()
-    return total / weights
-
-
 def fill_unknown(prior: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """The prior with unknown pixels (0) at their neighbours' mean, nearer neighbours first.
 

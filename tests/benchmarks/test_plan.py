@@ -78,8 +78,8 @@ def test_a_quick_part_without_captures_is_named() -> None:
         ("ours", "guidance", "2", False),
         ("ours", "weights", None, True),
         ("ours", "weights", 3, False),
-        ("fsgs", "pairing", "nonsense", False),
-        ("dngaussian", "patch_range", [3, 5], True),
+        ("fsgs", "monocular", "nonsense", False),
+        ("dngaussian", "hash_levels", 4, True),
     ],
 )
 def test_an_options_kind_is_what_the_method_declares(

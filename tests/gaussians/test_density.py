@@ -2,11 +2,10 @@
 
 import math
 
-import pytest
 import roma
 import torch
 
-from benchmarks.methods.fsgs import edges, unpool
+from benchmarks.methods.fsgs import unpool
 from extrap_train.gaussians.density import (
     GrowthStatistics,
     grow,
@@ -133,30 +132,20 @@ def test_opacity_is_capped_and_not_raised():
 def test_unpooling_puts_copies_of_the_neighbour_half_way():
     # distances of the first Gaussian to its three neighbours: 1, 2, 3
     parameters = _row([0.5, 0.01, 0.01, 0.01])
-    new, limited = unpool(parameters, proximity=1.0, scale=0.1, pairing="paper", most=100)
+    new, limited = unpool(parameters, proximity=1.0, scale=0.1, most=100)
     assert not limited
     torch.testing.assert_close(new.means[:, 0], torch.tensor([0.5, 1.0, 1.5]))
     torch.testing.assert_close(new.scales, torch.full((3, 3), 0.01))
     torch.testing.assert_close(new.opacities, torch.full((3,), 0.5))
     assert not new.sh_dc.any()
-    assert len(unpool(parameters, 100.0, 0.1, "paper", most=100)[0]) == 0
-    assert len(unpool(parameters, 1.0, 0.9, "paper", most=100)[0]) == 0
+    assert len(unpool(parameters, 100.0, 0.1, most=100)[0]) == 0
+    assert len(unpool(parameters, 1.0, 0.9, most=100)[0]) == 0
 
 
 def test_where_room_is_short_the_most_isolated_are_unpooled_and_the_cut_is_told():
     parameters = _row([0.5, 0.5, 0.5, 0.5])
     parameters.means[3, 0] = 10.0  # its three neighbours are the farthest
-    new, limited = unpool(parameters, proximity=1.0, scale=0.1, pairing="paper", most=3)
+    new, limited = unpool(parameters, proximity=1.0, scale=0.1, most=3)
     torch.testing.assert_close(new.means[:, 0], torch.tensor([6.0, 5.5, 5.0]))
     assert limited
-    assert not unpool(parameters, proximity=50.0, scale=0.1, pairing="paper", most=9)[1]
-
-
-@pytest.mark.parametrize(
-    ("pairing", "first"), [("paper", [0, 0, 0, 2, 2, 2]), ("released", [0, 2, 0, 2, 0, 2])]
-)
-def test_the_released_pairing_mixes_sources(pairing, first):
-    neighbours = torch.tensor([[1, 2, 3], [0, 2, 3], [1, 3, 0], [0, 1, 2]])
-    source, target = edges(torch.tensor([0, 2]), neighbours, pairing)
-    assert source.tolist() == first
-    assert target.tolist() == [1, 2, 3, 1, 3, 0]
+    assert not unpool(parameters, proximity=50.0, scale=0.1, most=9)[1]

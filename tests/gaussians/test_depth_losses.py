@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from extrap_train.gaussians.losses import (
-    edge_aware_smoothness,
     fill_unknown,
     normalised_patches,
     patch_depth_loss,
@@ -89,16 +88,6 @@ def test_flat_depth_has_a_finite_gradient():
     loss = patch_depth_loss(flat, _depth()[:16, :16], 5, True, 0.0)
     (loss + pearson_depth_loss(flat, _depth()[:16, :16])).backward()
     assert flat.grad.isfinite().all()
-
-
-def test_smoothness_spares_the_guides_edges():
-    depth = torch.zeros(8, 8)
-    depth[:, 4:] = 1
-    guide = 100 * depth
-    flat = torch.zeros(8, 8)
-    assert float(edge_aware_smoothness(depth, guide)) < 1e-6
-    # 8 unit steps among 2 · 56 differences
-    assert float(edge_aware_smoothness(depth, flat)) == pytest.approx(8 / 112)
 
 
 def test_filling_keeps_what_is_known_and_ends():

@@ -44,9 +44,7 @@ METHODS: dict[str, GaussianMethod] = {
     "fsgs": Fsgs(**GROWING, unpool_proximity=1e-4, unpool_scale=0.0),
     "dngaussian": DnGaussian(
         **GROWING | {"densify_least_opacity": 0.0}, hash_levels=4, hash_log2_size=10,
-        smooth_from=0, smooth_weight=0.1, shape_weight=2e-3, scale_weight=1e-3, opacity_weight=1e-3,
     ),
-    "dngaussian, sh": DnGaussian(**GROWING, color="sh"),
     "instantsplat": InstantSplat(**SMALL),
 }  # fmt: skip
 

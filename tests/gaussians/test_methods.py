@@ -194,13 +194,9 @@ def test_no_triangulated_point_and_no_random_one_is_refused() -> None:
         ("background", "grey"),
         ("rasterizer", "taichi"),
         ("monocular", "dpt"),
-        ("color", "rgb"),
         ("clear_every", -25),
-        ("patch_range", (1, 4)),
-        ("patch_range", (17, 5)),
         ("hash_levels", 1),
         ("hash_log2_size", -1),
-        ("hash_bound", 0.0),
     ],
 )
 def test_an_option_that_cannot_be_meant_is_named(option: str, value) -> None:
@@ -210,7 +206,7 @@ def test_an_option_that_cannot_be_meant_is_named(option: str, value) -> None:
 
 @pytest.mark.parametrize(
     ("option", "value"),
-    [("pairing", "released_code"), ("pseudo_every", 0), ("monocular", "dpt"), ("init", "mvs")],
+    [("pseudo_every", 0), ("monocular", "dpt"), ("init", "mvs")],
 )
 def test_an_option_of_fsgs_that_cannot_be_meant_is_named(option: str, value) -> None:
     with pytest.raises(InputError, match=option):
