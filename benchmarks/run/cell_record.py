@@ -39,19 +39,22 @@ def _all_different(values: list[str]) -> list[str]:
     return values
 
 
-@dataclass(frozen=True)
-class Measured:
-    """What a cell's record keeps of the making of its images, apart from their files."""
+@dataclass(frozen=True, kw_only=True)
+class MethodOutput:
+    """What became of a method's work; everything after `traceback` is of images that were made."""
 
-    seconds: Positive
-    wall_seconds: Positive
-    peak_memory_mib: Positive | None
-    given: dict[str, str]
-    counts: dict[str, Number]
+    status: Literal["ok", "failed", "unavailable", "made"]
+    reason: str = ""
+    traceback: str = ""
+    seconds: Positive = 0.0
+    wall_seconds: Positive = 0.0
+    peak_memory_mib: Positive | None = None
+    given: dict[str, str] = field(default_factory=dict)
+    counts: dict[str, Number] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class Cell:
+@dataclass(frozen=True, kw_only=True)
+class Cell(MethodOutput):
     """A cell's record, `cell.json`."""
 
     key: FileName
@@ -65,14 +68,6 @@ class Cell:
     protocol: str
     made_from: Manifest
     scored_from: Manifest
-    status: Literal["ok", "failed", "unavailable", "made"]
-    reason: str = ""
-    traceback: str = ""
-    seconds: Positive = 0.0
-    wall_seconds: Positive = 0.0
-    peak_memory_mib: Positive | None = None
-    given: dict[str, str] = field(default_factory=dict)
-    counts: dict[str, Number] = field(default_factory=dict)
     truths_apart: bool = False
     """Whether no truth was on the disk or in the method's process while it ran."""
     scoring_seconds: Positive | None = None

@@ -10,16 +10,24 @@ its output is checked (`method_output`) and kept. Later the images are scored.
 import hashlib
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Literal
 
 import torch
 
 from benchmarks.protocol.array_files import npy_bytes, png_bytes
 from benchmarks.protocol.draws import Draw
 from benchmarks.protocol.prepared_scene import Scene
-from benchmarks.run.cell_record import FAILED, OK, Cell, files_of, one_line, read_cell
+from benchmarks.run.cell_record import (
+    FAILED,
+    MADE,
+    OK,
+    Cell,
+    MethodOutput,
+    files_of,
+    one_line,
+    read_cell,
+)
 from benchmarks.run.method_output import CheckedOutput
 from extrap_train.config import MethodConfig, ScoringConfig
 from extrap_train.errors import InputError
@@ -28,8 +36,6 @@ from extrap_train.store.manifest import Manifest
 from extrap_train.store.records import write_record
 
 _DRAW = ("category", "sequence", "n_views", "draw", "seed")
-_CARRIED = ("seconds", "wall_seconds", "peak_memory_mib", "given", "counts", "truths_apart")
-"""What a cell takes over from another with the very same images."""
 
 
 @dataclass(frozen=True)
@@ -50,33 +56,30 @@ class CellJob:
     """A cell with the very same images, which only need scoring."""
 
 
-def _record(
-    job: CellJob, status: Literal["ok", "failed", "unavailable", "made"], reason: str = ""
-) -> Cell:
-    """A record that holds what the job says."""
+def _record(job: CellJob, output: MethodOutput, *, truths_apart: bool = False) -> Cell:
+    """The record of what a method made for a job."""
+    measured = {each.name: getattr(output, each.name) for each in fields(MethodOutput)}
     return Cell(
+        **measured,
         key=job.folder.name,
         method=job.method.name,
         scene=job.scene.name,
         protocol=job.protocol,
         made_from=job.made_from,
         scored_from=job.scored_from,
-        status=status,
-        reason=reason,
+        truths_apart=truths_apart,
         **{name: getattr(job.draw, name) for name in _DRAW},
     )
 
 
 def keep_output(job: CellJob, result: CheckedOutput, truths_apart: bool) -> Cell:
     """Write the cell of what a method has made, unscored, or of why it has not."""
-    output = result.output
-    record = replace(_record(job, output.status, output.reason), traceback=output.traceback)
+    is_made = result.output.status == MADE
+    record = _record(job, result.output, truths_apart=truths_apart and is_made)
     images = {f"{index}.png": png_bytes(pixels) for index, pixels in enumerate(result.images)}
     points = {}
     if result.points is not None:
         points["points.npy"] = npy_bytes(torch.from_numpy(result.points))
-    if output.measured is not None:
-        record = replace(record, truths_apart=truths_apart, **asdict(output.measured))
     return write_cell(job.folder, record, images, points)
 
 
@@ -91,7 +94,7 @@ def score_cell(job: CellJob) -> Cell:
     if made is None:
         raise InputError(f"{job.images_from}: is gone; run the table again")
     images, points = (files_of(job.images_from, kind) for kind in (made.images, made.points))
-    record = replace(_record(job, OK), **{name: getattr(made, name) for name in _CARRIED})
+    record = replace(_record(job, made, truths_apart=made.truths_apart), status=OK, reason="")
     try:
         scores = score_files(job.images_from, images, points, Scene.open(job.scene), job.scoring)
         took = time.perf_counter() - started
@@ -103,7 +106,7 @@ def score_cell(job: CellJob) -> Cell:
 
 def write_failure(job: CellJob, reason: str) -> Cell:
     """Write the cell of a job whose process ended without a record."""
-    return write_cell(job.folder, _record(job, FAILED, reason), {}, {})
+    return write_cell(job.folder, _record(job, MethodOutput(status=FAILED, reason=reason)), {}, {})
 
 
 def write_cell(

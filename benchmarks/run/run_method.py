@@ -18,9 +18,9 @@ from torch import Tensor
 
 from benchmarks.methods.base import Method, SceneInputs, Stopwatch, Synthesis, Unavailable
 from benchmarks.protocol.prepared_scene import RecordedDepth, Scene
-from benchmarks.run.cell_record import FAILED, MADE, UNAVAILABLE
+from benchmarks.run.cell_record import FAILED, MADE, UNAVAILABLE, MethodOutput
 from benchmarks.run.cells import CellJob
-from benchmarks.run.method_output import MethodOutput, check_measured, pack_output
+from benchmarks.run.method_output import pack_output, parse_output
 from extrap_train.config import MethodConfig, check_options
 from extrap_train.data.images import to_eight_bits
 from extrap_train.errors import InputError, did_you_mean
@@ -45,10 +45,11 @@ def run_method(job: CellJob) -> bytes:
             synthesis = _synthesize(job.method, inputs)
         return _packed(synthesis, inputs, job.method, watch.seconds, memory.mib)
     except Unavailable as error:
-        return pack_output(MethodOutput(UNAVAILABLE, str(error)))
+        return pack_output(MethodOutput(status=UNAVAILABLE, reason=str(error)))
     except BaseException as error:  # SystemExit and KeyboardInterrupt are its own, too
         reason = f"{type(error).__name__}: {error}"
-        return pack_output(MethodOutput(FAILED, reason, traceback.format_exc()))
+        trace = traceback.format_exc()
+        return pack_output(MethodOutput(status=FAILED, reason=reason, traceback=trace))
 
 
 def build_method(config: MethodConfig) -> Method:
@@ -113,13 +114,22 @@ def _packed(
         _require_floats(points, f"method {method.name}: points")
         arrays["points"] = points.detach().cpu().float().numpy()
     values = {
+        "status": MADE,
         "seconds": synthesis.seconds + _depth_share(inputs, method),
         "wall_seconds": wall_seconds,
         "peak_memory_mib": peak_memory_mib,
         "given": dict(synthesis.given),
         "counts": dict(synthesis.counts),
     }
-    return pack_output(MethodOutput(MADE, measured=check_measured(values, method.name)), arrays)
+    try:
+        return pack_output(parse_output(json.dumps(values)), arrays)
+    except TypeError as error:
+        raise InputError(
+            f"method {method.name}: seconds, given and counts take plain numbers and texts "
+            f"({error})"
+        ) from None
+    except InputError as error:
+        raise InputError(f"method {method.name}: {error}") from None
 
 
 class PeakMemory:
