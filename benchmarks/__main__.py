@@ -8,10 +8,10 @@ from importlib.metadata import version
 from pathlib import Path
 
 from benchmarks.catalogue import Catalogue, lpips_weights_of, require_only_output
+from extrap_train.command_options import option_rows
 from extrap_train.config import CATEGORIES, TableConfig
 from extrap_train.errors import InputError
 from extrap_train.exits import Ended, ends_in_one_line
-from extrap_train.help_text import option_rows
 
 PERF_NAMES = ("align", "depth", "gaussians", "prep", "sample", "train", "warp")
 KINDS = ("methods", "tables", "categories")

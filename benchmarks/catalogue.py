@@ -91,8 +91,7 @@ def _compose(name: str, content: dict[str, Any], overrides: Sequence[str]) -> Ta
     from hydra.core.config_store import ConfigStore
     from hydra.errors import HydraException
 
-    from extrap_train.option_errors import explain
-    from extrap_train.overrides import CommandLine
+    from extrap_train.command_line import CommandLine, explain
 
     words = CommandLine((), tuple(overrides)).prepared(TABLE)
     words += ["table@_global_=chosen_table", f"name={name}"]

@@ -14,10 +14,18 @@ from rich.console import Console
 from benchmarks.catalogue import Catalogue
 from benchmarks.protocol.prepared_scene import Scene, truths_removed
 from benchmarks.report.aggregate import read_results
-from benchmarks.run.cell_record import FAILED, MADE, OK, Cell, Plan
-from benchmarks.run.cells import CellJob, keep_output, score_cell, write_failure
+from benchmarks.run.cells import (
+    FAILED,
+    MADE,
+    OK,
+    Cell,
+    CellJob,
+    Plan,
+    keep_output,
+    score_cell,
+    write_failure,
+)
 from benchmarks.run.dry_run import print_plan
-from benchmarks.run.method_output import check_output
 from benchmarks.run.plan import (
     TableFolder,
     cell_jobs,
@@ -27,7 +35,7 @@ from benchmarks.run.plan import (
     require_different,
     selected_draws,
 )
-from benchmarks.run.run_method import build_method, run_method
+from benchmarks.run.run_method import build_method, check_output, run_method
 from extrap_train.config import TableConfig
 from extrap_train.errors import InputError
 from extrap_train.jobs import Died, Launcher

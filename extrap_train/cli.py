@@ -20,13 +20,11 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from extrap_train.command_options import GROUPS, CommandOptions, choices_of
+from extrap_train.command_line import CommandLine, explain
+from extrap_train.command_options import GROUPS, CommandOptions, choices_of, help_text
 from extrap_train.config import TASKS, DataPrepConfig, TrainConfig, notes, validate
 from extrap_train.errors import InputError
 from extrap_train.exits import ends_in_one_line
-from extrap_train.help_text import help_text
-from extrap_train.option_errors import explain
-from extrap_train.overrides import CommandLine
 from extrap_train.store import Outcome
 from extrap_train.terminal import terminal
 

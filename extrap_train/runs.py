@@ -17,9 +17,17 @@ from extrap_train.config import SceneOptions, SyntheticConfig, TrainConfig, dott
 from extrap_train.data.prepared import PreparedData
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import partial_path, write_atomic
-from extrap_train.store.cache import REMEDY, Conflict, read_manifest, require_same
 from extrap_train.store.digests import file_digest, folder_digest
-from extrap_train.store.manifest import Manifest, Split, code_version, package_version
+from extrap_train.store.manifest import (
+    REMEDY,
+    Conflict,
+    Manifest,
+    Split,
+    code_version,
+    package_version,
+    read_manifest,
+    require_same,
+)
 from extrap_train.store.records import read_record, read_yaml
 
 _NOT_PART_OF_THE_RUN = (

@@ -26,8 +26,7 @@ from extrap_train.data.json_files import read_json
 from extrap_train.errors import InputError, did_you_mean
 from extrap_train.store import Outcome
 from extrap_train.store.atomic import file_lock, remove_leftovers, write_atomic
-from extrap_train.store.cache import require_same
-from extrap_train.store.manifest import MANIFEST, Manifest
+from extrap_train.store.manifest import MANIFEST, Manifest, require_same
 from extrap_train.store.records import write_record
 
 Row = dict[str, str]

@@ -32,8 +32,7 @@ from extrap_train.runs import (
     run_folder,
     run_identity,
 )
-from extrap_train.store.cache import Conflict, read_manifest
-from extrap_train.store.manifest import Manifest, Split
+from extrap_train.store.manifest import Conflict, Manifest, Split, read_manifest
 from extrap_train.tasks.category import _opened
 from extrap_train.terminal import terminal
 

@@ -28,8 +28,7 @@ from extrap_train.data.synthetic import build_scene, surface_points
 from extrap_train.data.synthetic.capture import synthetic_sequence
 from extrap_train.data.transforms_json import TRANSFORMS, read_transforms
 from extrap_train.errors import InputError
-from extrap_train.store.cache import read_manifest
-from extrap_train.store.manifest import MANIFEST, Split
+from extrap_train.store.manifest import MANIFEST, Split, read_manifest
 from extrap_train.views import stack_poses
 
 CLOUD_POINTS = 20_000

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.protocol.prepared_scene import Scene
-from benchmarks.run.cell_record import OK, Cell, Plan, planned_cells, read_plan
+from benchmarks.run.cells import OK, Cell, Plan, planned_cells, read_plan
 from benchmarks.run.plan import TableFolder
 from benchmarks.score.significance import is_significant, mean_interval, sign_flip_p
 from extrap_train.config import MethodConfig, metric_direction

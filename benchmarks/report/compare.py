@@ -7,7 +7,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from benchmarks.report.aggregate import CELL, MEASURED, UNIT, Results, by_capture, read_results
-from benchmarks.run.cell_record import Cell
+from benchmarks.run.cells import Cell
 from benchmarks.run.identity import identity_of
 from benchmarks.run.plan import TableFolder
 from benchmarks.score.significance import (

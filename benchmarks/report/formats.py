@@ -9,7 +9,7 @@ from jinja2 import Environment
 
 from benchmarks.report.aggregate import Results
 from benchmarks.report.table_layout import Entry, Layout, heading_of
-from benchmarks.run.cell_record import one_line
+from benchmarks.run.cells import one_line
 
 _MARKDOWN_SPECIAL = {"<": "&lt;", ">": "&gt;"} | {letter: f"\\{letter}" for letter in "\\`*|[]"}
 _LATEX_SPECIAL = {

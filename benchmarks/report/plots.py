@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.report.aggregate import CAPTURE, Results
 from benchmarks.report.table_layout import name_of
-from benchmarks.run.cell_record import one_line
+from benchmarks.run.cells import one_line
 
 _BIN_DEG = 20
 _ASIDE_DEG = 0.7

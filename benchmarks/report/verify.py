@@ -12,7 +12,7 @@ from benchmarks.protocol.draws import Draw, Protocol
 from benchmarks.protocol.prepared_scene import Scene
 from benchmarks.report.aggregate import UNIT, Results, read_results
 from benchmarks.report.formats import tables
-from benchmarks.run.cell_record import OK, Cell, files_of
+from benchmarks.run.cells import OK, Cell, files_of
 from benchmarks.run.identity import cell_key, image_options, judged_columns, scores_manifest
 from benchmarks.run.plan import TableFolder, selected_draws
 from benchmarks.score import Score

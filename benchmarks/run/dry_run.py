@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.run.cell_record import Cell
-from benchmarks.run.cells import CellJob
+from benchmarks.run.cells import Cell, CellJob
 from benchmarks.run.identity import MISSING_WEIGHTS
 from benchmarks.run.plan import OpenJobs, TableFolder
 from benchmarks.score.scoring import missing_networks

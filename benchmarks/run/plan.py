@@ -11,8 +11,7 @@ from benchmarks.protocol.captures import Capture, freeze, open_captures, trained
 from benchmarks.protocol.draws import Draw, Protocol
 from benchmarks.protocol.prepared_scene import Scene, truths_of
 from benchmarks.protocol.scene_writing import prepare_scene
-from benchmarks.run.cell_record import OK, Cell, read_cell
-from benchmarks.run.cells import CellJob
+from benchmarks.run.cells import OK, Cell, CellJob, read_cell
 from benchmarks.run.identity import (
     cell_key,
     identity_of,

@@ -1,5 +1,5 @@
 """A method at work, in a process of its own: it is given a scene's inputs, and its output is handed
-over as bytes (`method_output`).
+over as bytes, of which every entry is checked (`check_output`).
 """
 
 import importlib
@@ -7,23 +7,34 @@ import json
 import os
 import random
 import traceback
-from dataclasses import fields, is_dataclass
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, get_type_hints
 
 import numpy as np
+import safetensors
+import safetensors.numpy
 import torch
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from torch import Tensor
 
 from benchmarks.methods.base import Method, SceneInputs, Stopwatch, Synthesis, Unavailable
 from benchmarks.protocol.prepared_scene import RecordedDepth, Scene
-from benchmarks.run.cell_record import FAILED, MADE, UNAVAILABLE, MethodOutput
-from benchmarks.run.cells import CellJob
-from benchmarks.run.method_output import pack_output, parse_output
+from benchmarks.run.cells import (
+    FAILED,
+    MADE,
+    OK,
+    UNAVAILABLE,
+    CellJob,
+    CheckedOutput,
+    MethodOutput,
+    one_line,
+)
 from extrap_train.config import MethodConfig, check_options
 from extrap_train.data.images import to_eight_bits
 from extrap_train.errors import InputError, did_you_mean
+from extrap_train.jobs import Died
 from extrap_train.metrics import require_unit_range
 
 PER_IMAGE = "per image"
@@ -166,3 +177,82 @@ def _depth_share(inputs: SceneInputs, method: MethodConfig) -> float:
     assert isinstance(inputs.depth_source, RecordedDepth)
     count = len(inputs.targets.world_to_cam) if method.time == PER_IMAGE else 1
     return inputs.depth_source.seconds / count
+
+
+_MAX_TRACEBACK_LINES = 200
+_MAX_WORDS = 100
+MAX_POINTS = 5_000_000
+"""Of a method's surface: more take hours to score."""
+_RECORD, _IMAGES, _POINTS = "record", "images", "points"
+_KIND = TypeAdapter(MethodOutput)
+
+
+def parse_output(content: str | bytes) -> MethodOutput:
+    """The output in JSON; InputError names the first entry that is wrong."""
+    try:
+        return _KIND.validate_json(content, strict=True)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        raise InputError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+
+
+def pack_output(output: MethodOutput, arrays: Mapping[str, np.ndarray] | None = None) -> bytes:
+    """Bytes for `check_output`; written by the process that is not trusted."""
+    record = np.frombuffer(_KIND.dump_json(_clean(output)), np.uint8)
+    contents = {name: np.ascontiguousarray(array) for name, array in (arrays or {}).items()}
+    return safetensors.numpy.save({**contents, _RECORD: record})
+
+
+def check_output(result: bytes | Died, targets: int, side: int, name: str) -> CheckedOutput:
+    """A method's result if it is sound and as it was asked for, else a failure with the reason."""
+    if isinstance(result, Died):
+        return CheckedOutput(MethodOutput(status=FAILED, reason=result.reason))
+    try:
+        return _checked(result, (targets, side, side, 3))
+    except InputError as error:
+        reason = one_line(f"method {name}: {error}")
+        return CheckedOutput(MethodOutput(status=FAILED, reason=reason))
+
+
+def _checked(result: bytes, wanted: tuple[int, ...]) -> CheckedOutput:
+    try:
+        arrays = safetensors.numpy.load(result)
+        content = arrays.pop(_RECORD).tobytes()
+    except (safetensors.SafetensorError, KeyError, ValueError, TypeError, AttributeError) as error:
+        raise InputError(f"returned no result ({type(error).__name__})") from None
+    output = _clean(parse_output(content))
+    if output.status == OK:
+        raise InputError("claims to be scored already")
+    if output.status != MADE:
+        kept = MethodOutput(status=output.status, reason=output.reason, traceback=output.traceback)
+        return CheckedOutput(kept)
+    images, points = arrays.get(_IMAGES), arrays.get(_POINTS)
+    if images is None or images.dtype != np.uint8:
+        raise InputError("returned no images")
+    if images.shape != wanted:
+        shapes = [(s[0], s[3], *s[1:3]) if len(s) == 4 else s for s in (images.shape, wanted)]
+        raise InputError(f"made images {shapes[0]}, asked were {shapes[1]}")
+    if points is not None:
+        if points.dtype != np.float32 or points.ndim != 2 or points.shape[1] != 3:
+            raise InputError(f"points are {points.dtype} of {points.shape}, not floats of (m, 3)")
+        if not np.isfinite(points).all() or len(points) > MAX_POINTS:
+            raise InputError(f"points must be finite and at most {MAX_POINTS:,}")
+    return CheckedOutput(output, [*images], points)
+
+
+def _clean(output: MethodOutput) -> MethodOutput:
+    """Every text printable and of a length for a table."""
+    if len(output.given) + len(output.counts) > _MAX_WORDS:
+        raise InputError(f"given and counts have more than {_MAX_WORDS} entries")
+    return replace(
+        output,
+        reason=one_line(output.reason),
+        traceback=_lines(output.traceback),
+        given={one_line(key): one_line(value) for key, value in output.given.items()},
+        counts={one_line(key): value for key, value in output.counts.items()},
+    )
+
+
+def _lines(text: str) -> str:
+    lines = text.splitlines()[-_MAX_TRACEBACK_LINES:]
+    return "\n".join(" " * (len(one) - len(one.lstrip())) + one_line(one) for one in lines)

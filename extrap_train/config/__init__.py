@@ -4,19 +4,6 @@ Light on purpose (no torch), so that `--help` is instant. YAMLs under `conf/` ch
 variants of a group; this package says what may stand in them.
 """
 
-from extrap_train.config.benchmark import (
-    CAPTURE_SOURCES,
-    DRAWS,
-    LPIPS_NETS,
-    METRICS,
-    CapturesConfig,
-    MethodConfig,
-    QuickConfig,
-    RulesConfig,
-    ScoringConfig,
-    TableConfig,
-    metric_direction,
-)
 from extrap_train.config.checks import (
     notes,
     require_published,
@@ -25,31 +12,35 @@ from extrap_train.config.checks import (
     validate,
     validate_model,
 )
-from extrap_train.config.commands import PAIR_TASKS, TASKS, DataPrepConfig, TrainConfig
-from extrap_train.config.completion import CompletionConfig, ConfidenceConfig, SplatsConfig
-from extrap_train.config.data import (
+from extrap_train.config.commands import (
+    PAIR_TASKS,
+    TASKS,
+    DataPrepConfig,
+    LauncherConfig,
+    LocalConfig,
+    SlurmConfig,
+    TrainConfig,
+    TrainerConfig,
+    ValidationConfig,
+)
+from extrap_train.config.data_sources import (
     CATEGORIES,
+    AlikedMatcherConfig,
     CategoryConfig,
     Co3dConfig,
     DataConfig,
-    PrepConfig,
-    SyntheticConfig,
-)
-from extrap_train.config.depth import (
     DatasetDepthConfig,
     DepthConfig,
-    Mast3rConfig,
-    MonocularConfig,
-    StereoConfig,
-)
-from extrap_train.config.launcher import LauncherConfig, LocalConfig, SlurmConfig
-from extrap_train.config.matching import (
-    AlikedMatcherConfig,
     FlowMatcherConfig,
     LoftrMatcherConfig,
+    Mast3rConfig,
     MatcherConfig,
+    MonocularConfig,
+    PrepConfig,
+    StereoConfig,
+    SyntheticConfig,
 )
-from extrap_train.config.model import (
+from extrap_train.config.model_options import (
     FAMILIES,
     NEAREST_ALONE,
     ClipConfig,
@@ -68,5 +59,23 @@ from extrap_train.config.options import (
     resolve_path,
     resolve_paths,
 )
-from extrap_train.config.scene import LoraConfig, SceneOptions
-from extrap_train.config.training import TrainerConfig, ValidationConfig
+from extrap_train.config.scene_options import (
+    CompletionConfig,
+    ConfidenceConfig,
+    LoraConfig,
+    SceneOptions,
+    SplatsConfig,
+)
+from extrap_train.config.table_options import (
+    CAPTURE_SOURCES,
+    DRAWS,
+    LPIPS_NETS,
+    METRICS,
+    CapturesConfig,
+    MethodConfig,
+    QuickConfig,
+    RulesConfig,
+    ScoringConfig,
+    TableConfig,
+    metric_direction,
+)

@@ -3,11 +3,15 @@
 from pathlib import Path
 from typing import Any
 
-from extrap_train.config.commands import PAIR_TASKS, DataPrepConfig, TrainConfig
-from extrap_train.config.data import Co3dConfig, PrepConfig, SyntheticConfig
-from extrap_train.config.model import NEAREST_ALONE, ModelConfig, SamplerConfig, SamplerOptions
+from extrap_train.config.commands import PAIR_TASKS, DataPrepConfig, TrainConfig, TrainerConfig
+from extrap_train.config.data_sources import Co3dConfig, PrepConfig, SyntheticConfig
+from extrap_train.config.model_options import (
+    NEAREST_ALONE,
+    ModelConfig,
+    SamplerConfig,
+    SamplerOptions,
+)
 from extrap_train.config.options import check_options
-from extrap_train.config.training import TrainerConfig
 from extrap_train.errors import InputError
 
 _MAX_LEVELS, _MAX_WIDTH = 8, 8192

@@ -1,16 +1,135 @@
-"""The whole tree of each command."""
+"""The whole tree of each command: how a model is trained and measured, and where jobs run."""
 
 from dataclasses import dataclass, field
 
-from extrap_train.config.completion import CompletionConfig
-from extrap_train.config.data import CategoryConfig, DataConfig, PrepConfig
-from extrap_train.config.depth import DepthConfig
-from extrap_train.config.launcher import LauncherConfig
-from extrap_train.config.matching import MatcherConfig
-from extrap_train.config.model import ModelConfig, SamplerOptions
+from extrap_train.config.data_sources import (
+    CategoryConfig,
+    DataConfig,
+    DepthConfig,
+    MatcherConfig,
+    PrepConfig,
+)
+from extrap_train.config.model_options import ModelConfig, SamplerOptions
 from extrap_train.config.options import MISSING, option
-from extrap_train.config.scene import SceneOptions
-from extrap_train.config.training import TrainerConfig, ValidationConfig
+from extrap_train.config.scene_options import CompletionConfig, SceneOptions
+
+
+@dataclass
+class TrainerConfig:
+    """How long, how often, on what."""
+
+    steps: int = option(1200, "optimiser steps; more than a finished run has continue it", low=1)
+    batch_size: int = option(16, "views per step and device", low=1)
+    warmup_steps: int = option(
+        100, "steps in which the learning rate rises to its full height", low=0
+    )
+    full_rate_steps: int = option(
+        400,
+        "steps at the full learning rate, which then falls as 1/sqrt(step), so that a run can be "
+        "continued",
+        low=1,
+    )
+    condition_dropout: float = option(
+        0.05, "share of the examples that are trained without their condition", low=0, high=1
+    )
+    min_snr: float | None = option(
+        None,
+        "clamp of the loss weight by signal-to-noise ratio (Hang et al. 2023: 5); null: no "
+        "weighting",
+        low=0.01,
+        high=1e6,
+    )
+    ema_decay: float = option(
+        0.999,
+        "decay of the averaged weights; 0 keeps no average and saves its memory",
+        low=0,
+        high=0.999999,
+    )
+    precision: str = option(
+        "auto",
+        "Lightning's precision; weights stay in single precision; auto: bf16-mixed where the "
+        "processor has units for it, else 32-true",
+        known=("auto", "32-true", "bf16-mixed", "16-mixed"),
+    )
+    gradient_checkpointing: bool = option(
+        False, "compute the denoiser's activations twice: less memory, more time"
+    )
+    compile: bool = option(
+        False, "compile the denoiser: minutes at the start, faster steps on a GPU"
+    )
+    accelerator: str = option(
+        "auto",
+        "hardware to train on; auto takes a GPU if there is one",
+        known=("auto", "cpu", "gpu", "cuda", "mps"),
+    )
+    devices: int = option(1, "GPUs, each with its own batch (distributed data parallel)", low=1)
+    checkpoint_every: int = option(
+        200, "steps between checkpoints; a killed run loses at most these", low=1
+    )
+    validate_every: int = option(
+        400,
+        "steps between validations, a multiple of trainer.checkpoint_every",
+        low=1,
+    )
+    workers: int = option(
+        0, "processes that load batches besides the training process", low=0, high=1024
+    )
+
+
+@dataclass
+class ValidationConfig:
+    """What the trained model is measured on: held-out sequences."""
+
+    examples: int = option(60, "held-out views, spread evenly over the test pairs", low=1)
+    batch_size: int = option(20, "views sampled at a time", low=1)
+    pictures: int = option(8, "rows of the picture sheet", low=1)
+    lpips_weights: str | None = option(
+        None,
+        'full lpips.LPIPS(net="squeeze") state dict; null: torchvision\'s cached backbone',
+    )
+
+
+@dataclass
+class LauncherConfig:
+    """Where independent jobs run; one subclass per kind of place."""
+
+    name: str = MISSING
+
+
+@dataclass
+class LocalConfig(LauncherConfig):
+    """Processes on this machine, as many as `workers` says."""
+
+    name: str = "local"
+
+
+@dataclass
+class SlurmConfig(LauncherConfig):
+    """One SLURM job array; the command waits for it and gathers the results."""
+
+    name: str = "slurm"
+    partition: str | None = option(None, "partition of the job array")
+    account: str | None = option(None, "account that the job array is charged to")
+    tasks: int = option(
+        200,
+        "array tasks that the jobs are divided among; clusters allow 1001 by default",
+        low=1,
+        high=1_000_000,
+    )
+    at_once: int = option(50, "most array tasks that run at a time", low=1, high=1_000_000)
+    cpus: int = option(1, "cores per task", low=1, high=1024)
+    memory_gib: float = option(4.0, "memory per task", unit="GiB", low=0.5, high=4096)
+    hours: float = option(
+        4.0,
+        "time limit of a task; unfinished jobs are submitted again, one per task",
+        unit="hours",
+        low=0.02,
+        high=10_000,
+    )
+    directives: dict[str, str] = option(
+        {}, "further sbatch options by their long names, as {constraint: avx512}"
+    )
+
 
 TASKS = {
     "category": "prepare a category, train its model, and measure it on held-out sequences",

@@ -48,11 +48,9 @@ from extrap_train.runs import (
     write_options,
 )
 from extrap_train.store import Outcome
-from extrap_train.store.cache import REMEDY, Conflict, claim
-from extrap_train.store.manifest import Manifest
-from extrap_train.tasks.leakage import require_unseen
+from extrap_train.store.manifest import REMEDY, Conflict, Manifest, claim
 from extrap_train.tasks.results import Results, draw_curve, draw_views, write_results
-from extrap_train.tasks.training_data import Prepare, data_module
+from extrap_train.tasks.training_data import Prepare, data_module, require_unseen
 from extrap_train.terminal import terminal
 
 

@@ -51,8 +51,8 @@ from extrap_train.reconstruction.planner import Query, expected_order, orbit_que
 from extrap_train.reconstruction.pose_check import check_poses
 from extrap_train.reconstruction.viewer import CloudViewer
 from extrap_train.store import Outcome
-from extrap_train.store.cache import claim
 from extrap_train.store.digests import file_digest
+from extrap_train.store.manifest import claim
 from extrap_train.tasks.completed import Completed, write_completed
 from extrap_train.tasks.scene_inputs import (
     require_space,

@@ -24,8 +24,7 @@ from extrap_train.reconstruction.depth_completion.training import (
 )
 from extrap_train.store import Outcome
 from extrap_train.store.atomic import write_atomic
-from extrap_train.store.cache import claim
-from extrap_train.store.manifest import Manifest
+from extrap_train.store.manifest import Manifest, claim
 from extrap_train.tasks.scene_model import open_model
 from extrap_train.terminal import progress, terminal
 

@@ -34,8 +34,8 @@ from extrap_train.metrics import Distance, lpips_or_reason
 from extrap_train.pictures import contact_sheet, curve, error_map, mark_holes
 from extrap_train.store import Outcome
 from extrap_train.store.atomic import write_atomic
-from extrap_train.store.cache import Claim, claim
 from extrap_train.store.digests import file_digest
+from extrap_train.store.manifest import Claim, claim
 from extrap_train.store.records import read_record
 from extrap_train.tasks.results import without_nan
 from extrap_train.tasks.scene_inputs import (

@@ -1,12 +1,16 @@
-"""The pairs that a category is trained on and measured on."""
+"""The pairs that a category is trained on and measured on: no capture may be on both sides."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 from extrap_train.config import TrainConfig
 from extrap_train.data.module import PairModule
 from extrap_train.data.pair_examples import ExampleReader
 from extrap_train.data.prepared import PreparedData
+from extrap_train.diffusion.checkpoint import is_own, saved_config
+from extrap_train.diffusion.packaged import packaged_names, packaged_weights
 from extrap_train.errors import InputError
+from extrap_train.store.manifest import MANIFEST, Manifest, read_manifest
 
 Prepare = Callable[[TrainConfig], list[PreparedData]]
 """Prepares every member of the category, or finds what was prepared before."""
@@ -24,3 +28,50 @@ def data_module(config: TrainConfig, prepared: list[PreparedData]) -> PairModule
                 f"and loosen the options under prep"
             )
     return PairModule(train, validation, config)
+
+
+def require_unseen(start: str | None, manifest: Manifest) -> None:
+    """Raise InputError if a held-out capture is one that the start (`model.start`) has seen."""
+    for model, seen in _ancestors(start):
+        for category, names in manifest.leaked_from(seen).items():
+            through = "" if model == start else f", by way of {model}"
+            first = seen.split[category].train[0]
+            is_rendered = manifest.split[category].source == "synthetic"
+            remedy = _other_seed(first) if is_rendered else _OTHERS
+            raise InputError(
+                f"model.start={start} was trained on {_listed(names)} of {category}{through}, "
+                f"which are to be held out: {remedy}, or model.start=null"
+            )
+
+
+_OTHERS = "hold out others (data.test_sequences, data.set_list)"
+
+
+def _ancestors(start: str | None) -> Iterator[tuple[str, Manifest]]:
+    """Each model that the start goes back to with its manifest, as far as they have one.
+
+    Published weights have none; they were trained on other data sets.
+    """
+    known: set[str] = set()
+    while start is not None and start not in known:
+        known.add(start)
+        folder = Path(start)
+        if not folder.exists() and start in packaged_names():
+            folder = packaged_weights(start)
+        if not is_own(folder):
+            return
+        if (folder.resolve().parent / MANIFEST).is_file():
+            yield start, read_manifest(folder.resolve().parent, "restore it from its run")
+        start = saved_config(folder).start
+
+
+def _listed(names: list[str]) -> str:
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    return ", ".join(names[:3]) + more
+
+
+def _other_seed(first_seen: str) -> str:
+    """The first rendered captures are held out, and another seed renders others."""
+    count = int(first_seen) if first_seen.isdigit() else 0
+    fewer = f"data.test_sequences={count} or fewer, " if count else ""
+    return f"give {fewer}another data.seed"

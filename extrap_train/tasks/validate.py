@@ -17,15 +17,13 @@ from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.metrics import lpips_or_reason
 from extrap_train.runs import Finished, RunFolder, existing_run, provenance, trained_on
 from extrap_train.store import Outcome
-from extrap_train.store.cache import Conflict, claim, read_manifest
 from extrap_train.store.digests import folder_digest
-from extrap_train.store.manifest import MANIFEST, Manifest
+from extrap_train.store.manifest import MANIFEST, Conflict, Manifest, claim, read_manifest
 from extrap_train.store.records import write_record
 from extrap_train.tasks.category import quieten_lightning
-from extrap_train.tasks.leakage import require_unseen
 from extrap_train.tasks.results import Results, write_results
 from extrap_train.tasks.scene_model import require_saved_options
-from extrap_train.tasks.training_data import Prepare, data_module
+from extrap_train.tasks.training_data import Prepare, data_module, require_unseen
 from extrap_train.terminal import terminal
 
 

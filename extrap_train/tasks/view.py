@@ -22,7 +22,7 @@ from extrap_train.errors import InputError, did_you_mean
 from extrap_train.geometry.orbits import LEAST_VIEWS, orbit_cameras
 from extrap_train.metrics import psnr, quantised
 from extrap_train.pictures import contact_sheet, film, mark_holes, picture_names, save_picture
-from extrap_train.store.cache import claim
+from extrap_train.store.manifest import claim
 from extrap_train.store.records import write_record
 from extrap_train.tasks.scene_inputs import (
     SceneInputs,

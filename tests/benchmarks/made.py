@@ -5,7 +5,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from benchmarks.report.aggregate import Results
-from benchmarks.run.cell_record import Cell, Plan
+from benchmarks.run.cells import Cell, Plan
 from benchmarks.run.plan import TableFolder
 from benchmarks.score import Score
 from extrap_train.config import MethodConfig, TableConfig

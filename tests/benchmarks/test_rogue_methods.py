@@ -17,7 +17,7 @@ import pytest
 from benchmarks.catalogue import Catalogue
 from benchmarks.report.aggregate import read_results
 from benchmarks.report.verify import verify
-from benchmarks.run.cell_record import Cell
+from benchmarks.run.cells import Cell
 from benchmarks.run.plan import TableFolder
 from benchmarks.run_table import RunOptions, run_table
 from tests.benchmarks.rogues import ENDS, HANGS, LEFTOVERS, SOUND, STATE, write_rogues

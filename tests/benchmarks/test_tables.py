@@ -16,8 +16,8 @@ from benchmarks.protocol.prepared_scene import Scene
 from benchmarks.report.aggregate import TIDY, read_results
 from benchmarks.report.compare import compare
 from benchmarks.run import run_method
-from benchmarks.run.method_output import check_output
 from benchmarks.run.plan import cell_jobs, open_protocol
+from benchmarks.run.run_method import check_output
 from extrap_train.errors import InputError
 from extrap_train.jobs.slurm import SubmittedLauncher
 from tests.benchmarks.tables import greys_folder, run_greys

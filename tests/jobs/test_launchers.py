@@ -16,9 +16,8 @@ import pytest
 from extrap_train.config import SlurmConfig
 from extrap_train.errors import InputError
 from extrap_train.jobs import Died, Launcher
-from extrap_train.jobs.build import open_launcher
 from extrap_train.jobs.local import LocalLauncher
-from extrap_train.jobs.slurm import SubmittedLauncher, slurm_launcher
+from extrap_train.jobs.slurm import SubmittedLauncher, open_launcher, slurm_launcher
 
 
 def square(number: int) -> int:

@@ -8,8 +8,7 @@ import pytest
 
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import partial_path
-from extrap_train.store.cache import Conflict, claim, read_manifest
-from extrap_train.store.manifest import MANIFEST, Manifest
+from extrap_train.store.manifest import MANIFEST, Conflict, Manifest, claim, read_manifest
 
 _ONE = Manifest.of({"seed": 0}, {"photograph": "aa"})
 _OTHERS = [

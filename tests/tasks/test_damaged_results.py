@@ -36,8 +36,7 @@ from extrap_train.reconstruction.map_files import (
     save_input_seconds,
     save_view,
 )
-from extrap_train.store.cache import read_manifest
-from extrap_train.store.manifest import MANIFEST, Manifest
+from extrap_train.store.manifest import MANIFEST, Manifest, read_manifest
 from extrap_train.store.records import write_record
 from extrap_train.views import View
 

@@ -18,7 +18,7 @@ from extrap_train.errors import InputError
 from extrap_train.store.manifest import MANIFEST, Manifest, Split
 from extrap_train.store.records import write_record
 from extrap_train.tasks import category
-from extrap_train.tasks.leakage import require_unseen
+from extrap_train.tasks.training_data import require_unseen
 
 
 def _split(

@@ -1,6 +1,7 @@
-"""Where photographs come from, and which of them become training data."""
+"""Where photographs, matches and depth come from, and what becomes training data."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from extrap_train.config.options import MISSING, option
 
@@ -126,3 +127,120 @@ class PrepConfig:
     correction_grid: int = option(
         12, "control points of a correction along each side", low=4, high=64
     )
+
+
+@dataclass
+class MatcherConfig:
+    """How points of one picture are found in another; one subclass per matcher."""
+
+    name: str = MISSING
+
+
+@dataclass
+class FlowMatcherConfig(MatcherConfig):
+    """Dense inverse search: a flow for every pixel, without any weights."""
+
+    name: str = "flow"
+    image_size: int = option(
+        512,
+        "longest side that is matched at; smaller pictures are enlarged up to twice",
+        unit="pixels",
+        low=16,
+        high=8192,
+    )
+
+
+@dataclass
+class LoftrMatcherConfig(MatcherConfig):
+    """LoFTR with MINIMA's weights: semi-dense, across modalities and wide baselines."""
+
+    name: str = "loftr"
+    checkpoint: str | None = option(None, "file of weights; required")
+    image_size: int = option(
+        640, "longer side that is matched at", unit="pixels", low=16, high=8192
+    )
+    weights: ClassVar[str] = (
+        "minima_loftr.ckpt of github.com/LSXI7/MINIMA (or LoFTR's own, of github.com/zju3dv/LoFTR)"
+    )
+
+
+@dataclass
+class AlikedMatcherConfig(MatcherConfig):
+    """ALIKED's keypoints, matched by their descriptors: sparse, across wide baselines."""
+
+    name: str = "aliked"
+    checkpoint: str | None = option(None, "file of weights; required")
+    image_size: int = option(
+        1024,
+        "longest side that is matched at; smaller pictures stay as they are",
+        unit="pixels",
+        low=16,
+        high=8192,
+    )
+    keypoints: int = option(4096, "most keypoints per picture", low=2, high=20_000)
+    weights: ClassVar[str] = "aliked-n16.pth of github.com/Shiaoming/ALIKED"
+
+
+@dataclass
+class DepthConfig:
+    """Where depth comes from; one subclass per source."""
+
+    name: str = MISSING
+
+
+@dataclass
+class DatasetDepthConfig(DepthConfig):
+    """The depth that the data set brings."""
+
+    name: str = "dataset"
+
+
+@dataclass
+class StereoConfig(DepthConfig):
+    """Plane-sweep multi-view stereo for known poses."""
+
+    name: str = "stereo"
+    planes: int = option(96, "depth hypotheses, evenly spaced in inverse depth", low=3, high=4096)
+    neighbours: int = option(4, "other views that vote", low=1, high=64)
+    image_size: int = option(
+        256, "longer side that depth is estimated at", unit="pixels", low=16, high=8192
+    )
+
+
+@dataclass
+class Mast3rConfig(DepthConfig):
+    """MASt3R's or DUSt3R's point maps of view pairs."""
+
+    name: str = "mast3r"
+    checkpoint: str | None = option(None, "file of weights; required")
+    weights: ClassVar[str] = (
+        "weights of MASt3R or DUSt3R, for instance "
+        "MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric.pth of github.com/naver/mast3r"
+    )
+    neighbours: int = option(4, "most pairs per view", low=1, high=64)
+    image_size: int = option(
+        512,
+        "longer side that the network sees: what its weights were trained on",
+        unit="pixels",
+        low=16,
+        high=8192,
+    )
+    square: bool = option(
+        False,
+        "show square pictures whole; the 512-pixel weights know 4:3 and wider, so they are cut "
+        "to that otherwise",
+    )
+
+
+@dataclass
+class MonocularConfig(DepthConfig):
+    """Depth Anything, its scale and shift from matches at the known poses."""
+
+    name: str = "monocular"
+    model: str = option(
+        "depth-anything/Depth-Anything-V2-Small-hf",
+        "folder of a transformers model, or a name in the cache of downloads",
+    )
+    matcher: MatcherConfig = MISSING
+    """matcher@depth.matcher=aliked chooses another."""
+    neighbours: int = option(4, "most other views that a view is matched with", low=1, high=64)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Any
 
-from extrap_train.config.launcher import SlurmConfig
+from extrap_train.config.commands import SlurmConfig
 from extrap_train.config.options import MISSING, option
 
 CAPTURE_SOURCES = ("synthetic", "co3d", "reconfusion", "scenes")
