@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from lightning.fabric import Fabric
 from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 
-from benchmarks.methods.base import SceneInputs, views_with_depth
-from benchmarks.methods.diffusion import Diffusion, Painted
+from benchmarks.methods.base import SceneInputs, Synthesis, views_with_depth
+from benchmarks.methods.diffusion import Diffusion
 from extrap_train.config import LoraConfig
 from extrap_train.config.options import option
 from extrap_train.data.scene_pairs import adaptation_pairs
@@ -32,8 +32,8 @@ class AdaptedDiffusion(Diffusion):
         low=0.001,
     )
 
-    def painted(self, model: ExtrapolationModel, inputs: SceneInputs) -> Painted:
-        """Adapt, paint, and take the adapter off again."""
+    def sample(self, model: ExtrapolationModel, inputs: SceneInputs) -> Synthesis:
+        """Adapt, sample, and take the adapter off again."""
         views = [view.squared(model.config.warp_size) for view in views_with_depth(inputs)]
         options = LoraConfig(steps=self.lora_steps)
         pairs = adaptation_pairs(
@@ -53,7 +53,7 @@ class AdaptedDiffusion(Diffusion):
                 seed=inputs.seed,
                 fabric=Fabric(accelerator=device, devices=1, plugins=alone),
             )
-            made = super().painted(model, inputs)
+            made = super().sample(model, inputs)
         return replace(
             made,
             given={**made.given, "adaptation ended by": done.ended},

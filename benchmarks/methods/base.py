@@ -55,7 +55,7 @@ class Synthesis:
 
     images: Float[Tensor, "n 3 h w"]
     """In [0, 1], one a target, in the order of `SceneInputs.targets`."""
-    seconds: float
+    seconds: float = 0.0
     """Perform time as the paper defines it (III-A.2). A Gaussian method: preprocessing and
     optimisation. A diffusion method: generation and alignment, per image. `Stopwatch` takes it.
     """

@@ -1,7 +1,7 @@
 """Diffusion methods as rows of a table: a model of one family samples every target view."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -34,21 +34,10 @@ from extrap_train.errors import InputError
 
 
 @dataclass(frozen=True)
-class Painted:
-    """The targets as a model has painted them, and what else came of it; see `Synthesis`."""
-
-    images: Float[Tensor, "n 3 s s"]
-    """At the model's own size."""
-    given: Mapping[str, str] = field(default_factory=dict)
-    points: Float[Tensor, "m 3"] | None = None
-    counts: Mapping[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
 class Diffusion:
     """Samples the targets, each from its nearest inputs, with a trained model.
 
-    A subclass that paints them otherwise has a `painted` of its own.
+    A subclass that samples them otherwise has a `sample` of its own.
     """
 
     family: str = option(
@@ -99,27 +88,29 @@ class Diffusion:
             )
         self._warm_up(model, inputs)
         with Stopwatch() as watch:
-            made = self.painted(model, inputs)
+            made = self.sample(model, inputs)
         size = (inputs.targets.height, inputs.targets.width)
         given = {"weights": folder.name, "depth": "used" if self.family != "zeronvs" else "scale"}
         given |= photographs_used(inputs.fine_views)
         if made.images.shape[-2:] != size:
             given["made at"] = f"{made.images.shape[-1]} px"
-        return Synthesis(
+        return replace(
+            made,
             images=_resampled(made.images, size),
             seconds=watch.seconds / len(made.images),
             given=given | dict(made.given),
-            points=made.points,
-            counts=made.counts,
         )
 
-    def painted(self, model: ExtrapolationModel, inputs: SceneInputs) -> Painted:
-        """Paint every target from the inputs alone. The model is shared: it stays as it is."""
+    def sample(self, model: ExtrapolationModel, inputs: SceneInputs) -> Synthesis:
+        """Every target from the inputs alone, at the model's own size, without the time.
+
+        The model is shared: it stays as it is.
+        """
         made = self.generator(model).generate(
             views_with_depth(inputs), inputs.targets, target_names(inputs), inputs.seed
         )
         given = {} if self.references is None else {"references": f"the nearest {self.references}"}
-        return Painted(made.images, given)
+        return Synthesis(made.images, given=given)
 
     def generator(self, model: ExtrapolationModel) -> DiffusionGenerator:
         """What paints views with this method's options."""

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks.methods.base import SceneInputs
-from benchmarks.methods.diffusion import Diffusion, Painted, target_names
+from benchmarks.methods.base import SceneInputs, Synthesis
+from benchmarks.methods.diffusion import Diffusion, target_names
 from extrap_train.config import CompletionConfig, StereoConfig
 from extrap_train.depth.sources import depth_source
 from extrap_train.diffusion.generator import GeneratedViews, ViewGenerator
@@ -31,8 +31,8 @@ class IncrementalDiffusion(Diffusion):
     stereo's, whatever source the inputs' came from.
     """
 
-    def painted(self, model: ExtrapolationModel, inputs: SceneInputs) -> Painted:
-        """Paint and merge every target; beside the images, the points of the whole map."""
+    def sample(self, model: ExtrapolationModel, inputs: SceneInputs) -> Synthesis:
+        """Sample and merge every target; beside the images, the points of the whole map."""
         options = CompletionConfig()
         world = fit_world_frame(stack_cameras([view.camera for view in inputs.fine_views]))
         size = model.config.warp_size
@@ -46,7 +46,7 @@ class IncrementalDiffusion(Diffusion):
         steps: list[Step] = []
         known = complete(known, queries, workshop, lambda _, __, step: steps.append(step))
         agreeing = [s for s in steps if s.agreement >= options.confidence.least_agreement]
-        return Painted(
+        return Synthesis(
             images=_kept(painter, known, names),
             given={"references": "inputs and painted views", "painted views' depth": "stereo"},
             points=_points(known, world, options),

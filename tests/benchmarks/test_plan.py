@@ -78,7 +78,6 @@ def test_a_quick_part_without_captures_is_named() -> None:
         ("ours", "guidance", "2", False),
         ("ours", "weights", None, True),
         ("ours", "weights", 3, False),
-        ("fsgs", "monocular", "nonsense", False),
         ("dngaussian", "hash_levels", 4, True),
     ],
 )

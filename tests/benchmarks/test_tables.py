@@ -245,7 +245,7 @@ def test_a_dry_run_says_what_scoring_again_costs(
         file.write_text(json.dumps(json.loads(file.read_text()) | {"scoring_seconds": 90.0}))
     capsys.readouterr()
     assert run_greys(own, copy, "scoring.lpips=[vgg]", dry_run=True) == 0
-    assert "about 6 min 0 s of one core" in capsys.readouterr().out
+    assert "about 0:06:00 (h:mm:ss) of one core" in capsys.readouterr().out
 
 
 def test_the_version_is_the_packages(capsys: pytest.CaptureFixture[str]) -> None:
