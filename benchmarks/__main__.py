@@ -200,10 +200,12 @@ def _verify(options: argparse.Namespace) -> int:
 
 
 def _compare(options: argparse.Namespace) -> int:
+    from benchmarks.report.aggregate import read_results
     from benchmarks.report.compare import compare
     from benchmarks.run.plan import TableFolder
 
-    table = compare(TableFolder(Path(options.before)), TableFolder(Path(options.after)))
+    before, after = (TableFolder(Path(name)) for name in (options.before, options.after))
+    table = compare(read_results(before), read_results(after))
     print(table.to_string(index=False, float_format=lambda value: f"{value:.4f}"))
     if (table["scoring"] == "other").any():
         print(

@@ -6,10 +6,13 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
+from datetime import timedelta
 from functools import partial
 from pathlib import Path
+from statistics import median
 
 from rich.console import Console
+from rich.table import Table
 
 from benchmarks.catalogue import Catalogue
 from benchmarks.protocol.prepared_scene import Scene, truths_removed
@@ -25,8 +28,9 @@ from benchmarks.run.cells import (
     score_cell,
     write_failure,
 )
-from benchmarks.run.dry_run import print_plan
+from benchmarks.run.identity import MISSING_WEIGHTS
 from benchmarks.run.plan import (
+    OpenJobs,
     TableFolder,
     cell_jobs,
     open_jobs,
@@ -36,6 +40,7 @@ from benchmarks.run.plan import (
     selected_draws,
 )
 from benchmarks.run.run_method import build_method, check_output, run_method
+from benchmarks.score.scoring import missing_networks
 from extrap_train.config import TableConfig
 from extrap_train.errors import InputError
 from extrap_train.jobs import Died, Launcher
@@ -43,7 +48,7 @@ from extrap_train.jobs.guests import AsGuest, GuestLauncher
 from extrap_train.jobs.local import LocalLauncher
 from extrap_train.jobs.slurm import slurm_launcher
 from extrap_train.store.atomic import file_lock, remove_leftovers
-from extrap_train.store.records import write_record
+from extrap_train.store.records import read_record, write_record
 from extrap_train.terminal import progress, terminal
 
 _CELLS_PER_SCORER = 8
@@ -219,3 +224,54 @@ def _launchers(
     # A further process loads for as long as it takes to score some cells here.
     with LocalLauncher(min(workers, 1 + len(jobs) // _CELLS_PER_SCORER)) as local:
         yield partial(guests.run, run_method), local
+
+
+def print_plan(
+    jobs: Sequence[CellJob], left: OpenJobs, folder: TableFolder, console: Console
+) -> None:
+    """What would run, how long, and what is missing: a method's weights, and the networks without
+    which a column stays empty.
+    """
+    making, scoring = _seconds_by_method(folder)
+    everywhere = [second for seconds in scoring.values() for second in seconds]
+    shown = Table("method", "cells", "to make", "to score", "seconds a cell", "missing")
+    total, unknown = 0.0, []
+    for name in dict.fromkeys(job.method.name for job in jobs):
+        mine = [job for job in jobs if job.method.name == name]
+        to_make, to_score = (
+            sum(job.method.name == name for job in part) for part in (left.to_make, left.to_score)
+        )
+        make_s, score_s = making[name], scoring[name] or everywhere
+        if (to_make and not make_s) or (to_score and not score_s):
+            unknown.append(name)
+        each = median(make_s or [0.0]), median(score_s or [0.0])
+        total += each[0] * to_make + each[1] * (to_make + to_score)
+        weights = mine[0].made_from.inputs["weights"]
+        is_missing = weights.startswith(MISSING_WEIGHTS)
+        missing = weights.removeprefix(MISSING_WEIGHTS) if is_missing else ""
+        rate = f"{sum(each):.1f}" if make_s else "not yet known"
+        shown.add_row(name, *map(str, (len(mine), to_make, to_score)), rate, missing)
+    console.print(shown)
+    for column, reason in missing_networks(jobs[0].scoring).items():
+        console.print(f"{column} stays empty: {reason}")
+    duration = timedelta(seconds=round(total))
+    known = [f"about {duration} (h:mm:ss) of one core"] if total or not unknown else []
+    more = [f"no finished cell tells how long {', '.join(unknown)} will take"] if unknown else []
+    console.print("; ".join([*known, *more]))
+
+
+def _seconds_by_method(
+    folder: TableFolder,
+) -> tuple[dict[str, list[float]], dict[str, list[float]]]:
+    """What making and scoring each finished cell took, of any options."""
+    making, scoring = defaultdict(list), defaultdict(list)
+    for file in folder.cells.glob("*/cell.json"):
+        try:
+            cell = read_record(file, Cell, "")
+        except InputError:
+            continue
+        if cell.images:
+            making[cell.method].append(cell.wall_seconds)
+        if cell.scoring_seconds is not None:
+            scoring[cell.method].append(cell.scoring_seconds)
+    return making, scoring

@@ -21,8 +21,7 @@ from extrap_train.geometry.viewpoints import (
     pairwise_angles,
     scene_center,
 )
-from extrap_train.store.atomic import write_atomic
-from extrap_train.store.records import read_record
+from extrap_train.store.records import read_record, write_record
 from extrap_train.views import Camera
 
 FORMAT = 1
@@ -56,18 +55,11 @@ class Protocol:
     @property
     def sha256(self) -> str:
         """Of the whole content: every result carries it."""
-        return digest(self._content())
-
-    def _content(self) -> dict[str, Any]:
-        rules, draws = asdict(self.rules), [asdict(draw) for draw in self.draws]
-        return {"format": FORMAT, "rules": rules, "draws": draws}
+        return digest({"format": FORMAT, **asdict(self)})
 
     def write(self, file: Path) -> None:
-        """Freeze into a file, a draw a line."""
-        content = self._content()
-        draws = ",\n  ".join(json.dumps(draw) for draw in content.pop("draws"))
-        head = json.dumps({**content, "sha256": self.sha256})
-        write_atomic(file, f'{head[:-1]},\n "draws": [\n  {draws}\n ]}}\n'.encode())
+        """Freeze into a file."""
+        write_record(file, ProtocolRecord(FORMAT, self.rules, [*self.draws], self.sha256))
 
     @classmethod
     def read(cls, file: Path) -> "Protocol":

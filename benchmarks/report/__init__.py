@@ -4,8 +4,7 @@ from pathlib import Path
 
 from benchmarks.catalogue import Catalogue
 from benchmarks.report.aggregate import Results
-from benchmarks.report.formats import latex, markdown, numbers, tables
-from benchmarks.report.page import page
+from benchmarks.report.formats import latex, markdown, numbers, page, tables
 from benchmarks.report.plots import plots
 from benchmarks.report.table_layout import Layout, lay_out
 from benchmarks.run.plan import TableFolder

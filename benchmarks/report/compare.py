@@ -6,31 +6,26 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from benchmarks.report.aggregate import CELL, MEASURED, UNIT, Results, by_capture, read_results
-from benchmarks.run.cells import Cell
-from benchmarks.run.identity import identity_of
-from benchmarks.run.plan import TableFolder
-from benchmarks.score.significance import (
+from benchmarks.report.aggregate import (
+    CELL,
     FEWEST_CAPTURES,
+    MEASURED,
+    UNIT,
+    Results,
+    by_capture,
     is_significant,
     mean_interval,
     sign_flip_p,
 )
+from benchmarks.run.cells import Cell
+from benchmarks.run.identity import identity_of
 from extrap_train.config import metric_direction
 from extrap_train.errors import InputError
 
 _HEADING = ["method", "draw", "n_views", "metric"]
 
 
-def compare(before: TableFolder, after: TableFolder) -> pd.DataFrame:
-    """`compare_results` of two folders.
-
-    Raises InputError where the two are of different protocols, or of different data.
-    """
-    return compare_results(read_results(before), read_results(after))
-
-
-def compare_results(one: Results, two: Results) -> pd.DataFrame:
+def compare(one: Results, two: Results) -> pd.DataFrame:
     """One row per method, draw, number of views and metric: both means over the cells that both
     have, the paired difference with its 95 % interval over captures, the `chance` of it, a verdict,
     and whether both were scored alike (`same`, or `other`: other weights of the networks, options

@@ -7,9 +7,8 @@ from typing import Any
 
 import pandas as pd
 
-from benchmarks.report.aggregate import Results
+from benchmarks.report.aggregate import FEWEST_CAPTURES, Results
 from benchmarks.run.cells import OK, one_line
-from benchmarks.score.significance import FEWEST_CAPTURES
 from extrap_train.config import metric_direction
 
 NAMES = {
@@ -48,7 +47,7 @@ class Entry:
     rank: int | None = None
     """1 is the best of its column, 2 the second."""
     ties_best: bool = False
-    """No worse than the best beyond chance (`benchmarks.score.significance`)."""
+    """No worse than the best beyond chance (`benchmarks.report.aggregate`)."""
     title: str = ""
     """Interval and count, or why there is no number."""
 

@@ -4,6 +4,8 @@ checked: such a file may be damaged, or somebody else's by now. YAML is read as 
 
 import dataclasses
 import json
+import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,6 +25,20 @@ def write_record(path: Path, record: object) -> None:
     """Write a dataclass as indented JSON, atomically. NaN and infinities raise ValueError."""
     content = dataclasses.asdict(record)  # type: ignore[call-overload]
     write_atomic(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
+
+
+def write_summary(folder: Path, content: Mapping[str, Any]) -> None:
+    """Write a result's `summary.json`, atomically; NaN, as of a mean over no view, becomes null."""
+    text = json.dumps(_without_nan(content), indent=1) + "\n"
+    write_atomic(folder / "summary.json", text.encode())
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def read_record(path: Path, kind: type[T], remedy: str) -> T:

@@ -1,6 +1,5 @@
 """What a completed scene leaves behind: cloud, views, models, pictures and `summary.json`."""
 
-import json
 import time
 from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -35,7 +34,7 @@ from extrap_train.reconstruction.report import (
     view_consistency,
 )
 from extrap_train.runs import provenance
-from extrap_train.store.atomic import write_atomic
+from extrap_train.store.records import write_summary
 from extrap_train.tasks.scene_inputs import photograph_digests
 from extrap_train.tasks.scene_model import UsedWeights, frames_learnt
 from extrap_train.tasks.splats import write_fitted_splats
@@ -107,7 +106,7 @@ def write_completed(
         "steps": step_records(done.steps),
         "provenance": provenance(config, {"scene": config.scene or ""}),
     }
-    write_atomic(folder / "summary.json", (json.dumps(summary, indent=1) + "\n").encode())
+    write_summary(folder, summary)
     console.print(f"painted with {used or 'exact renderings of the scene'}")
     _print_what_was_added(done, summary, config, console)
     _print(summary, console)

@@ -1,6 +1,5 @@
 """`task=depth`: train the network that gives painted views their depth."""
 
-import json
 from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
@@ -23,8 +22,8 @@ from extrap_train.reconstruction.depth_completion.training import (
     save_examples,
 )
 from extrap_train.store import Outcome
-from extrap_train.store.atomic import write_atomic
 from extrap_train.store.manifest import Manifest, claim
+from extrap_train.store.records import write_summary
 from extrap_train.tasks.scene_model import open_model
 from extrap_train.terminal import progress, terminal
 
@@ -63,7 +62,7 @@ def run(config: TrainConfig) -> Outcome:
         scores = calibrate(network, _stored(config, folder, held_out).captures())
         save_depth_network(network, folder / "depth_network.safetensors")
         summary = {"steps": training.step, "held_out": asdict(scores)}
-        write_atomic(folder / "summary.json", (json.dumps(summary, indent=1) + "\n").encode())
+        write_summary(folder, summary)
         _print_scores(scores, folder, console)
     return Outcome(folder, is_reused=training.step == before)
 

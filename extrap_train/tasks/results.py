@@ -1,7 +1,6 @@
 """What a finished training run leaves behind: numbers, pictures and `summary.json`."""
 
 import io
-import json
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from extrap_train.errors import InputError
 from extrap_train.pictures import contact_sheet, curve, error_map, mark_holes
 from extrap_train.runs import RunFolder
 from extrap_train.store.atomic import write_atomic
+from extrap_train.store.records import write_summary
 
 _ABOVE = "validation/above_baselines_db"
 
@@ -61,7 +61,7 @@ def write_results(
         "parameters": results.parameters,
         "provenance": {**results.provenance, "validation": asdict(config.validation)},
     }
-    write_atomic(folder.summary, (json.dumps(without_nan(summary), indent=1) + "\n").encode())
+    write_summary(folder.path, summary)
     console.print(_table(validation))
     for name, reason in missing.items():
         console.print(f"missing {name}: {reason}")
@@ -122,15 +122,6 @@ def draw_curve(folder: RunFolder) -> None:
         series = {"model": rows[_ABOVE].tolist(), "best baseline": [0.0] * len(rows)}
         path = folder.samples / "curve.png"
         curve(rows["step"].tolist(), series, "PSNR above the best baseline, dB", path)
-
-
-def without_nan(value: Any) -> Any:
-    """JSON has no NaN: a mean over no view at all becomes null, wherever it stands."""
-    if isinstance(value, dict):
-        return {key: without_nan(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [without_nan(item) for item in value]
-    return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def _table(validation: dict[str, dict[str, float]]) -> Table:

@@ -1,7 +1,6 @@
 """`task=scene`: a category model adapted to one scene from its input views alone."""
 
 import io
-import json
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -36,8 +35,7 @@ from extrap_train.store import Outcome
 from extrap_train.store.atomic import write_atomic
 from extrap_train.store.digests import file_digest
 from extrap_train.store.manifest import Claim, claim
-from extrap_train.store.records import read_record
-from extrap_train.tasks.results import without_nan
+from extrap_train.store.records import read_record, write_summary
 from extrap_train.tasks.scene_inputs import (
     SceneInputs,
     input_frames,
@@ -272,8 +270,7 @@ def _write(
         "held_out": measured,
         "missing": missing if measured else {"held_out": "every frame of the scene is an input"},
     }
-    content = json.dumps(without_nan(summary), indent=1) + "\n"
-    write_atomic(folder / "summary.json", content.encode())
+    write_summary(folder, summary)
 
 
 def _describe(done: Adaptation, measured: dict[str, dict[str, float]]) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks.report.compare import compare_results
+from benchmarks.report.compare import compare
 from tests.benchmarks.made import cell, results
 
 
@@ -16,7 +16,7 @@ def _verdict(change: np.ndarray, metric: str = "psnr") -> Any:
     after = results(
         *(cell("a", str(i), 0, 20.0 + i + c, {"dists": 0.5 + c}) for i, c in enumerate(change))
     )
-    return compare_results(before, after).set_index("metric").loc[metric]
+    return compare(before, after).set_index("metric").loc[metric]
 
 
 def test_better_and_worse_go_with_the_metrics_direction() -> None:
@@ -39,16 +39,14 @@ def test_five_captures_are_too_few_however_alike() -> None:
 def test_memory_has_no_verdict() -> None:
     before = results(*(cell("a", str(i), 0, 20.0) for i in range(8)))
     after = results(*(replace(cell("a", str(i), 0, 20.0), peak_memory_mib=5.0) for i in range(8)))
-    assert set(compare_results(before, after).query("metric == 'peak_memory_mib'")["verdict"]) == {
-        ""
-    }
+    assert set(compare(before, after).query("metric == 'peak_memory_mib'")["verdict"]) == {""}
 
 
 def test_other_judges_are_noted_row_by_row() -> None:
     """One of two methods was scored with other weights: its scores say so, its time does not."""
     both = [cell(name, str(i), 0, 20.0) for name in ("a", "b") for i in range(6)]
     again = [cell("a", str(i), 0, 20.0, scoring="other judges") for i in range(6)]
-    rows = compare_results(results(*both), results(*again, *both[6:]))
+    rows = compare(results(*both), results(*again, *both[6:]))
     found = rows.set_index(["method", "metric"])["scoring"]
     expected = {("a", "psnr"): "other", ("a", "seconds"): "same", ("b", "psnr"): "same"}
     pd.testing.assert_series_equal(found[list(expected)], pd.Series(expected), check_names=False)

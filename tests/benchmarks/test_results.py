@@ -4,10 +4,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks.report.aggregate import UNIT, to_best
+from benchmarks.report.aggregate import UNIT, mean_interval, to_best
 from benchmarks.report.formats import latex, markdown
 from benchmarks.report.table_layout import NAMES, Entry, Layout, Panel, Row, lay_out
-from benchmarks.score.significance import mean_interval
 from extrap_train.config import METRICS, metric_direction
 from tests.benchmarks.made import cell, results
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from benchmarks.score.significance import (
+from benchmarks.report.aggregate import (
     FEWEST_CAPTURES,
     is_significant,
     mean_interval,

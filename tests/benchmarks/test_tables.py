@@ -13,7 +13,7 @@ import pytest
 from benchmarks.__main__ import main
 from benchmarks.catalogue import Catalogue
 from benchmarks.protocol.prepared_scene import Scene
-from benchmarks.report.aggregate import TIDY, read_results
+from benchmarks.report.aggregate import TIDY, Results, read_results
 from benchmarks.report.compare import compare
 from benchmarks.run import run_method
 from benchmarks.run.plan import cell_jobs, open_protocol
@@ -255,11 +255,15 @@ def test_the_version_is_the_packages(capsys: pytest.CaptureFixture[str]) -> None
     assert capsys.readouterr().out.strip() == version("extrap-train")
 
 
+def _results(output: Path) -> Results:
+    return read_results(greys_folder(output))
+
+
 def test_compare_pairs_cells(own: Path, finished: Path, copy: Path) -> None:
-    same = compare(greys_folder(finished), greys_folder(copy))
+    same = compare(_results(finished), _results(copy))
     assert (same[same["metric"] == "psnr"]["verdict"] == "the same").all()
     run_greys(own, copy, "options.dark.level=0.45")
-    changed = compare(greys_folder(finished), greys_folder(copy)).set_index(["method", "metric"])
+    changed = compare(_results(finished), _results(copy)).set_index(["method", "metric"])
     row = changed.loc[("dark", "psnr")]
     assert row["verdict"] == "too few captures to tell"
     assert row["captures"] == 2
@@ -272,7 +276,7 @@ def test_compare_notes_another_scoring(
     own: Path, finished: Path, copy: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run_greys(own, copy, "scoring.lpips=[squeeze]")
-    rows = compare(greys_folder(finished), greys_folder(copy)).set_index("metric")
+    rows = compare(_results(finished), _results(copy)).set_index("metric")
     assert set(rows.loc["psnr", "scoring"]) == {"other"}
     assert set(rows.loc["seconds", "scoring"]) == {"same"}
     capsys.readouterr()
@@ -287,14 +291,14 @@ def test_compare_keeps_draws_apart_and_refuses_other_photographs(
 ) -> None:
     draws = "draws=[random,spread]"
     assert run_greys(own, copy, draws, quick=True) == 0
-    same = compare(greys_folder(copy), greys_folder(copy)).query("metric == 'psnr'")
+    same = compare(_results(copy), _results(copy)).query("metric == 'psnr'")
     assert list(same["draw"]) == ["random", "random", "spread", "spread"]
     assert list(same["captures"]) == [1, 1, 1, 1]
     assert run_greys(own, tmp_path / "other", "captures.render_size=32", quick=True) == 0
     with pytest.raises(
         InputError, match=r"different photographs or cameras of apple-0000-3-random"
     ):
-        compare(greys_folder(finished), greys_folder(tmp_path / "other"))
+        compare(_results(finished), _results(tmp_path / "other"))
 
 
 def test_two_runs_on_one_folder_do_not_mix(own: Path, copy: Path) -> None:

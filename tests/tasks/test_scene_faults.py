@@ -1,5 +1,6 @@
 """What goes wrong while a scene is painted or adapted to is one line that says what to turn."""
 
+import json
 import math
 import shutil
 from pathlib import Path
@@ -12,7 +13,7 @@ from extrap_train.cli import register_schemas, typed_config
 from extrap_train.diffusion.checkpoint import load_model, save_model
 from extrap_train.diffusion.generator import sample_views
 from extrap_train.errors import InputError
-from extrap_train.tasks.results import without_nan
+from extrap_train.store.records import write_summary
 
 _VIEW = ["task=view", "pose=frame000003"]
 _SHORT = ["task=scene", "minutes=0.2", "lora.steps=2", "lora.validate_every=2"]
@@ -36,8 +37,9 @@ def test_pictures_that_are_no_numbers_are_not_delivered(refused, broken, tmp_pat
     assert not (tmp_path / task[0].removeprefix("task=") / "hydrant-0000").exists()
 
 
-def test_json_has_no_nan_wherever_it_stands() -> None:
-    found = without_nan({"losses": [(0, math.nan), (1, 0.5)], "psnr": {"all": math.nan}})
+def test_a_summary_has_no_nan_wherever_it_stands(tmp_path) -> None:
+    write_summary(tmp_path, {"losses": [(0, math.nan), (1, 0.5)], "psnr": {"all": math.nan}})
+    found = json.loads((tmp_path / "summary.json").read_text())
     assert found == {"losses": [[0, None], [1, 0.5]], "psnr": {"all": None}}
 
 
