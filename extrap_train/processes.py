@@ -4,7 +4,7 @@ others join it.
 
 import os
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -37,13 +37,8 @@ class Opening:
     is_finished: bool
     checkpoint: str | None
     """Path of the checkpoint to resume from."""
-
-
-@dataclass(frozen=True)
-class _Announced:
-    launch: dict[str, str]
+    launch: dict[str, str] = field(default_factory=lambda: _launch())
     """What tells this launch from an earlier one."""
-    opening: Opening
 
 
 def is_first() -> bool:
@@ -56,7 +51,7 @@ def is_first() -> bool:
 
 def announce(folder: Path, opening: Opening) -> None:
     """Tell the other processes of this launch that the run is open."""
-    write_record(_announcement(folder), _Announced(_launch(), opening))
+    write_record(_announcement(folder), opening)
 
 
 def join(folder: Path, wait_s: float = _WAIT_S) -> Opening:
@@ -88,8 +83,8 @@ def _read_announced(folder: Path) -> Opening | None:
     file = _announcement(folder)
     if not file.exists():
         return None
-    told = read_record(file, _Announced, "delete it and start the command again")
-    return told.opening if told.launch == _launch() else None
+    opening = read_record(file, Opening, "delete it and start the command again")
+    return opening if opening.launch == _launch() else None
 
 
 def _announcement(folder: Path) -> Path:

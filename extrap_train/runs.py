@@ -4,7 +4,7 @@ import hashlib
 import json
 import platform
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +17,14 @@ from extrap_train.config import SceneOptions, SyntheticConfig, TrainConfig, dott
 from extrap_train.data.prepared import PreparedData
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import partial_path, write_atomic
-from extrap_train.store.digests import file_digest, folder_digest
+from extrap_train.store.digests import weights_digest
 from extrap_train.store.manifest import (
     REMEDY,
     Conflict,
     Manifest,
     Split,
     code_version,
-    package_version,
+    package_versions,
     read_manifest,
     require_same,
 )
@@ -54,7 +54,6 @@ model recommends to sample with is part of the run as far as it is used, under `
 
 _LATEST = "latest"
 """Link to the newest run of a model and category."""
-_PACKAGES = ("torch", "lightning", "diffusers", "numba", "numpy")
 
 
 @dataclass(frozen=True)
@@ -168,7 +167,7 @@ def run_manifest(config: TrainConfig, prepared: list[PreparedData]) -> Manifest:
     """What the run follows from: its options, the prepared data, and the weights it starts from."""
     inputs, split = trained_on(config, prepared)
     if (start := config.model.start) is not None and (path := Path(start)).exists():
-        inputs["model.start"] = folder_digest(path) if path.is_dir() else file_digest(path)
+        inputs["model.start"] = weights_digest(path)
     return Manifest.of(run_identity(config), inputs, split)
 
 
@@ -206,7 +205,8 @@ def require_same_options(folder: RunFolder, config: TrainConfig) -> None:
     if not (config.resume and folder.has_learnt):
         return
     before = read_manifest(folder.path)
-    require_same(folder.path, replace(before, options=_plain(run_identity(config))))
+    now = Manifest.of(run_identity(config), before.inputs, before.split)
+    require_same(folder.path, now)
     if folder.options.exists():
         read_yaml(folder.options, REMEDY)  # a file that is not ours is not overwritten
     if in_sweep() and folder.summary.is_file():
@@ -216,11 +216,6 @@ def require_same_options(folder: RunFolder, config: TrainConfig) -> None:
                 f"{folder.path}: made with different trainer.steps or validation (it has "
                 f"{finished.steps} steps, the job asks for {config.trainer.steps}); {REMEDY}"
             )
-
-
-def _plain(options: dict[str, Any]) -> dict[str, Any]:
-    plain: dict[str, Any] = json.loads(json.dumps(options))
-    return plain
 
 
 def write_options(folder: RunFolder, config: TrainConfig, *, at_least: int) -> None:
@@ -278,5 +273,5 @@ def provenance(config: TrainConfig, data_hashes: dict[str, str]) -> dict[str, An
         "threads": torch.get_num_threads(),
         "python": platform.python_version(),
         "code": code_version(),
-        "versions": {name: package_version(name) for name in _PACKAGES},
+        "versions": package_versions(),
     }

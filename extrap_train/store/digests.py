@@ -56,6 +56,11 @@ def folder_digest(folder: Path) -> str:
     return digest.hexdigest()
 
 
+def weights_digest(weights: Path) -> str:
+    """SHA-256 of a file of weights, or of a model's folder."""
+    return folder_digest(weights) if weights.is_dir() else file_digest(weights)
+
+
 def _hashed(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -70,8 +70,7 @@ class Manifest:
     ) -> "Manifest":
         """A result's manifest, with the versions that run now."""
         plain = json.loads(json.dumps(options))  # tuples become lists, as they will be read back
-        packages = {name: package_version(name) for name in _PACKAGES}
-        return cls(plain, inputs or {}, split or {}, code_version(), packages)
+        return cls(plain, inputs or {}, split or {}, code_version(), package_versions())
 
     def differences(self, before: "Manifest") -> list[str]:
         """Each option, input and category that was another, in words; empty for the same result."""
@@ -116,6 +115,11 @@ def package_version(name: str) -> str | None:
         return version(name)
     except PackageNotFoundError:
         return None
+
+
+def package_versions() -> dict[str, str | None]:
+    """The versions of the packages that results depend on most."""
+    return {name: package_version(name) for name in _PACKAGES}
 
 
 @cache

@@ -14,10 +14,9 @@ from rich.table import Table
 from extrap_train.config import TrainConfig
 from extrap_train.data.sequences import Frame, FrameSequence
 from extrap_train.data.synthetic import SyntheticScene
-from extrap_train.errors import InputError
 from extrap_train.gaussians.fit import Diverged
 from extrap_train.geometry.world_frame import WorldFrame
-from extrap_train.metrics import psnr, quantised, squeeze_lpips, ssim
+from extrap_train.metrics import lpips_or_reason, psnr, quantised, ssim
 from extrap_train.pictures import colour_depth, contact_sheet, error_map, mark_holes
 from extrap_train.reconstruction.cloud import PointCloud, cloud_of
 from extrap_train.reconstruction.completion import REFERENCES, Step, Workshop
@@ -223,15 +222,10 @@ def _compare_held_out(
         "ssim": float(ssim(images, photos).mean()),
         "lpips": None,
     }
-    try:
-        scores["lpips"] = float(
-            squeeze_lpips(config.validation.lpips_weights)(images, photos).mean()
-        )
-    except InputError as error:
-        if config.validation.lpips_weights is not None:
-            raise
-        return scores, {"lpips": str(error)}
-    return scores, {}
+    distance, missing = lpips_or_reason(config.validation.lpips_weights)
+    if distance is not None:
+        scores["lpips"] = float(distance(images, photos).mean())
+    return scores, missing
 
 
 def _held_out(

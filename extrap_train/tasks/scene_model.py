@@ -24,20 +24,14 @@ from extrap_train.diffusion.packaged import (
     packaged_weights,
 )
 from extrap_train.errors import InputError
-from extrap_train.runs import RunFolder, newest_run
-from extrap_train.store.digests import file_digest, folder_digest
-from extrap_train.store.records import read_record
+from extrap_train.runs import Finished, RunFolder, newest_run
+from extrap_train.store.digests import folder_digest, weights_digest
 from extrap_train.tasks.scene_inputs import frame_digest, required_scene
 from extrap_train.terminal import terminal
 from extrap_train.views import Camera, View
 
 _OF_TRAINING = ("name", "start", "learning_rate", "projection_rate", "weight_decay")
 """Say nothing of what a trained model is."""
-
-
-@dataclass(frozen=True)
-class _TrainedSteps:
-    steps: int
 
 
 @dataclass(frozen=True)
@@ -62,7 +56,7 @@ class UsedWeights:
             raise InputError(f"adapter={adapter}: no such folder; give an adapter of task=scene")
         return cls(
             name=name,
-            sha256=_content_digest(_folder_of(name)),
+            sha256=weights_digest(_folder_of(name)),
             is_packaged=not path.exists(),
             steps=_steps_of(path) if path.exists() else packaged_steps(name),
             adapter=str(adapter.resolve()) if adapter else None,
@@ -88,16 +82,10 @@ def model_options(config: TrainConfig) -> dict[str, Any]:
     return dotted({"model": asdict(config.model)})
 
 
-def _content_digest(weights: Path) -> str:
-    return folder_digest(weights) if weights.is_dir() else file_digest(weights)
-
-
 def _steps_of(model: Path) -> int | None:
     """Of a run's model, from the run's summary."""
-    summary = RunFolder(model.parent).summary
-    if model.name != "model" or not summary.is_file():
-        return None
-    return read_record(summary, _TrainedSteps, "train the run again (task=category)").steps
+    run = RunFolder(model.parent)
+    return Finished.read(run).steps if model == run.model and run.summary.is_file() else None
 
 
 def trained_model(config: TrainConfig) -> ExtrapolationModel:
