@@ -14,9 +14,8 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from rich.console import Console
 
-from extrap_train.config import TrainConfig, resolve_paths
+from extrap_train.config import TrainConfig, TrainerConfig, resolve_paths
 from extrap_train.data.module import PairModule
-from extrap_train.data.prepared import PreparedData
 from extrap_train.device import (
     advise_on_training_memory,
     require_accelerator,
@@ -41,7 +40,6 @@ from extrap_train.runs import (
     RunFolder,
     in_sweep,
     point_latest,
-    provenance,
     require_same_options,
     run_folder,
     run_manifest,
@@ -49,7 +47,7 @@ from extrap_train.runs import (
 )
 from extrap_train.store import Outcome
 from extrap_train.store.manifest import REMEDY, Conflict, Manifest, claim
-from extrap_train.tasks.results import Results, draw_curve, draw_views, write_results
+from extrap_train.tasks.results import draw_curve, draw_views, write_results
 from extrap_train.tasks.training_data import Prepare, data_module, require_unseen
 from extrap_train.terminal import terminal
 
@@ -83,8 +81,8 @@ def run(config: TrainConfig, prepare: Prepare) -> Outcome:
             if is_first():
                 save_model(training.model, folder.model)
                 draw_curve(folder)
-                results = _results(training, prepared, missing, seconds)
-                write_results(results, config, folder, console)
+                steps = training.validated_step
+                write_results(training, prepared, missing, seconds, steps, folder, console)
         if is_first():  # a longer training goes on from the newest, but for a sweep's job
             thin_checkpoints(folder.checkpoints, keep=0 if in_sweep() else 1)
     return Outcome(folder.path, opening.is_finished)
@@ -155,25 +153,6 @@ def _train(
     seconds["validate"] = training.validation_seconds
 
 
-def _results(
-    training: CategoryTraining,
-    prepared: list[PreparedData],
-    missing: dict[str, str],
-    seconds: dict[str, float],
-) -> Results:
-    return Results(
-        scores=training.scores(),
-        shown=training.pictures(),
-        missing=missing,
-        seconds=seconds,
-        steps=training.validated_step,
-        parameters=sum(p.numel() for p in training.model.parameters()),
-        provenance=provenance(
-            training.config, {d.folder.name: d.manifest["key"] for d in prepared}
-        ),
-    )
-
-
 def quieten_lightning() -> None:
     """Its tips and device lists say nothing about the user's run."""
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
@@ -217,25 +196,33 @@ class _Pictures(lightning.Callback):
             draw_views(pl_module.pictures(), self.folder / f"step-{trainer.global_step:08d}.png")
 
 
+def quiet_trainer(options: TrainerConfig, **more: Any) -> lightning.Trainer:
+    """Lightning's trainer on the options' hardware, without its own checkpoints and bars."""
+    return lightning.Trainer(
+        accelerator=options.accelerator,
+        precision=cast(Any, trainer_precision(options)),
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        deterministic="warn",
+        **more,
+    )
+
+
 def _trainer(
     config: TrainConfig, folder: RunFolder, checkpoint: str | None, kept: Checkpoints
 ) -> lightning.Trainer:
     options = config.trainer
     resumed_step = _resumed_step(checkpoint)
-    return lightning.Trainer(
-        accelerator=options.accelerator,
+    return quiet_trainer(
+        options,
         devices=options.devices,
-        precision=cast(Any, trainer_precision(options)),
         max_steps=options.steps,
         max_epochs=-1,
         check_val_every_n_epoch=max(1, options.validate_every // kept.every),
         reload_dataloaders_every_n_epochs=int(resumed_step % kept.every > 0),  # a short first epoch
         num_sanity_val_steps=0,
         use_distributed_sampler=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        deterministic="warn",
         logger=[
             MetricsTable(folder.path / "metrics.csv", resumed_step),
             TensorBoardLogger(folder.path, name="", version="tensorboard"),

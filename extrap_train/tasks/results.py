@@ -1,65 +1,56 @@
 """What a finished training run leaves behind: numbers, pictures and `summary.json`."""
 
-import io
 import math
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
-from extrap_train.config import TrainConfig
+from extrap_train.data.prepared import PreparedData
 from extrap_train.diffusion.evaluation import Prediction, summarise
+from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.errors import InputError
 from extrap_train.pictures import contact_sheet, curve, error_map, mark_holes
-from extrap_train.runs import RunFolder
+from extrap_train.runs import RunFolder, provenance
 from extrap_train.store.atomic import write_atomic
 from extrap_train.store.records import write_summary
 
 _ABOVE = "validation/above_baselines_db"
 
 
-@dataclass(frozen=True)
-class Results:
-    """What training and validation found."""
-
-    scores: pd.DataFrame
-    """One row per held-out view and method."""
-    shown: Prediction
-    """The views for the picture sheet."""
-    missing: dict[str, str]
-    """Metrics that could not be computed, with the reason."""
-    seconds: dict[str, float]
-    """Of the last session of the run: prepare, train, validate."""
-    steps: int
-    parameters: int
-    provenance: dict[str, Any]
-
-
 def write_results(
-    results: Results, config: TrainConfig, folder: RunFolder, console: Console
+    measured: CategoryTraining,
+    prepared: Sequence[PreparedData],
+    missing: dict[str, str],
+    seconds: dict[str, float],
+    steps: int,
+    folder: RunFolder,
+    console: Console,
 ) -> None:
     """Write tables, pictures and, last of all, the summary that marks the run as finished.
 
-    Raises InputError, before anything is written, if a score that must be a number is none.
+    `missing` names metrics that could not be computed, with the reason; `steps` is how long the
+    model was trained. Raises InputError, before anything is written, if a score that must be a
+    number is none.
     """
-    _require_finite(results)
-    validation = summarise(results.scores)
-    missing = results.missing | _undefined(validation["model"], results.missing)
-    text = io.StringIO()
-    results.scores.to_csv(text, index=False)
-    write_atomic(folder.path / "validation.csv", text.getvalue().encode())
-    draw_views(results.shown, folder.samples / "final.png")
+    config, scores = measured.config, measured.scores()
+    _require_finite(scores, missing)
+    validation = summarise(scores)
+    missing = missing | _undefined(validation["model"], missing)
+    write_atomic(folder.path / "validation.csv", scores.to_csv(index=False).encode())
+    draw_views(measured.pictures(), folder.samples / "final.png")
+    data = {each.folder.name: each.manifest["key"] for each in prepared}
     summary = {
         "validation": validation,
         "missing": missing,
-        "seconds": results.seconds,
-        "steps": results.steps,
-        "parameters": results.parameters,
-        "provenance": {**results.provenance, "validation": asdict(config.validation)},
+        "seconds": seconds,
+        "steps": steps,
+        "parameters": sum(p.numel() for p in measured.model.parameters()),
+        "provenance": {**provenance(config, data), "validation": asdict(config.validation)},
     }
     write_summary(folder.path, summary)
     console.print(_table(validation))
@@ -74,11 +65,11 @@ _WITHOUT_PIXELS = {
 }
 
 
-def _require_finite(results: Results) -> None:
+def _require_finite(scores: pd.DataFrame, missing: Mapping[str, str]) -> None:
     """Scores over some of a view's pixels are undefined where there are none; others never are."""
-    optional = {*_WITHOUT_PIXELS, *results.missing}
-    for name in results.scores.columns.difference(["method", "view", *optional]):
-        odd = results.scores[~np.isfinite(results.scores[name])]
+    optional = {*_WITHOUT_PIXELS, *missing}
+    for name in scores.columns.difference(["method", "view", *optional]):
+        odd = scores[~np.isfinite(scores[name])]
         if len(odd):
             method, view = odd.iloc[0][["method", "view"]]
             raise InputError(

@@ -1,6 +1,5 @@
 """`task=scene`: a category model adapted to one scene from its input views alone."""
 
-import io
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -235,9 +234,7 @@ def _measure(
     images = {"model": before.images, "adapted": after.images}
     names = [view.name for view in targets]
     scores = score_images(images, truth, after.warp.mask, names, distance)
-    text = io.StringIO()
-    scores.to_csv(text, index=False)
-    write_atomic(folder / "held_out.csv", text.getvalue().encode())
+    write_atomic(folder / "held_out.csv", scores.to_csv(index=False).encode())
     contact_sheet(
         {
             "warp": mark_holes(after.warp.image, after.warp.mask),
