@@ -58,7 +58,7 @@ Making = Callable[[Sequence[CellJob]], Iterator[tuple[int, bytes | Died]]]
 
 @dataclass(frozen=True)
 class RunOptions:
-    """What the command line says beside the table."""
+    """Options of `benchmark run` besides the table's own."""
 
     quick: bool = False
     dry_run: bool = False

@@ -29,11 +29,11 @@ from extrap_train.store import Outcome
 from extrap_train.terminal import terminal
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
-"""What a full disk says, wherever it is written to."""
+"""Errors of a full disk."""
 _CLOSED = (errno.EACCES, errno.EROFS)
-"""What is said of a place that may not be read or written."""
+"""Errors of a path that may not be read or written."""
 _NO_FOLDER = (errno.ENOTDIR, errno.ENOENT, errno.EEXIST)
-"""What is said below an output that can be no folder."""
+"""Errors below an output that can be no folder."""
 
 TRAIN = CommandOptions(
     "python -m extrap_train", "train", TrainConfig, TASKS, ("experiment", "sweep")
@@ -90,10 +90,10 @@ def _compose(options: CommandOptions, run: Callable[[Any], Outcome | Path | None
                 terminal(stderr=True).print(f"note: {note}")
             return run(typed)
         except OSError as error:
-            said = _remedy(error, output)
-            if said is None:
+            remedy = _remedy(error, output)
+            if remedy is None:
                 raise
-            message = f"{error.filename or output}: {error.strerror}; {said}"
+            message = f"{error.filename or output}: {error.strerror}; {remedy}"
             raise InputError(message) from error
 
     @hydra.main(version_base="1.3", config_path="pkg://conf", config_name=options.config_name)

@@ -1,4 +1,4 @@
-"""Everything that a Hydra command can be told, and how `--help` says it."""
+"""The options of a Hydra command, and its `--help`."""
 
 import difflib
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -33,7 +33,7 @@ GROUPS: dict[str, list[type]] = {
 
 @dataclass(frozen=True)
 class CommandOptions:
-    """What one command can be told."""
+    """The options of one command."""
 
     program: str
     """As it is started."""

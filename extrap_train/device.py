@@ -97,7 +97,7 @@ def advise_on_adapting_memory(lora: LoraConfig, trainer: TrainerConfig) -> Itera
 def advise_on_sampling_memory(at_once: int, trainer: TrainerConfig) -> Iterator[None]:
     """`advise_on_training_memory` for sampling so many views at once."""
     remedies = [
-        (at_once > 1, f"painted_at_once={max(1, at_once // 2)}"),
+        (at_once > 1, f"sample_batch_size={max(1, at_once // 2)}"),
         (torch.cuda.is_available() and trainer.accelerator != "cpu", "trainer.accelerator=cpu"),
     ]
     with _out_of_memory_advice(f"sampling {at_once} views at once", remedies):

@@ -77,12 +77,12 @@ def _error(arguments: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
         (["category=hydrant", "data=co3d"], "give data.root=FOLDER"),
         (
             ["category=hydrant", "model=small_megascenes", "model.geometry=true"],
-            "model.family=megascenes is told no depth of the warp",
+            "model.family=megascenes is not conditioned on the warp",
         ),
         (["category=hydrant", "sampler.compat=megascenes"], "predicts `sample`: leave it out"),
         (
             ["category=hydrant", "model=small_megascenes", "model.references=3"],
-            "told of the nearest alone: give model.references=1",
+            "conditioned on the nearest alone; give model.references=1",
         ),
         (["category=hydrant", "sampler.solver=heun"], "known: ddim, dpmpp, unipc"),
         (["category=hydrant", "sampler.solver=unipc", "sampler.eta=1"], "need sampler.solver=ddim"),

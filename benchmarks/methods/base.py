@@ -28,7 +28,7 @@ class Unavailable(InputError):
 
 @dataclass(frozen=True)
 class SceneInputs:
-    """All that a method is told about a scene: the same for every method of a cell's row.
+    """All that a method knows of a scene: the same for every method of a cell's row.
 
     No field leads to the photographs behind `targets`.
     """
@@ -88,8 +88,8 @@ class Method(Protocol):
     """One row of a table."""
 
     def weight_files(self, category: str) -> Sequence[Path]:
-        """Files beside the code that decide a category's images: their content is part of a cell's
-        key.
+        """Files that decide a category's images, besides the code; a cell's key covers their
+        content.
 
         Raises `Unavailable` where one is missing, with its name and where it comes from.
         """

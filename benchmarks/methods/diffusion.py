@@ -68,8 +68,8 @@ class Diffusion:
 
     def sampler(self, model: ExtrapolationModel) -> SamplerConfig:
         """How every view is sampled."""
-        said = SamplerOptions(steps=self.steps, guidance=self.guidance, eta=self.eta)
-        return sampler_for(said, model.config)
+        chosen = SamplerOptions(steps=self.steps, guidance=self.guidance, eta=self.eta)
+        return sampler_for(chosen, model.config)
 
     def weight_files(self, category: str) -> Sequence[Path]:
         """The files of the model's folder."""

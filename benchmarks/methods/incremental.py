@@ -32,7 +32,7 @@ class IncrementalDiffusion(Diffusion):
     """
 
     def sample(self, model: ExtrapolationModel, inputs: SceneInputs) -> Synthesis:
-        """Sample and merge every target; beside the images, the points of the whole map."""
+        """Sample and merge every target; returns the points of the whole map as well."""
         options = CompletionConfig()
         world = fit_world_frame(stack_cameras([view.camera for view in inputs.fine_views]))
         size = model.config.warp_size

@@ -43,7 +43,7 @@ def bent(depth: Float[Tensor, "h w"], generator: torch.Generator) -> Float[Tenso
     return depth * (1 + 0.03 * torch.sin(6 * (a - 0.5) * u + 6 * (b - 0.5) * v + 6.3 * phase))
 
 
-def ridden(depth: Float[Tensor, "h w"], generator: torch.Generator) -> Float[Tensor, "h w"]:
+def with_outliers(depth: Float[Tensor, "h w"], generator: torch.Generator) -> Float[Tensor, "h w"]:
     """1 % noise, and every fifth pixel anywhere between half and twice its depth."""
     wild = torch.rand(depth.shape, generator=generator) < 0.2
     factor = 0.5 * 4 ** torch.rand(depth.shape, generator=generator)
@@ -54,7 +54,7 @@ NOISES: dict[str, Noise] = {
     "clean": clean,
     "noisy 1%": noisy,
     "bent 3%": bent,
-    "outliers 20%": ridden,
+    "outliers 20%": with_outliers,
 }
 
 

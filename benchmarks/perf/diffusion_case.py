@@ -150,7 +150,7 @@ def _describe(device: torch.device, images: int, milliseconds: float, run: Run, 
         torch.cuda.reset_peak_memory_stats()
         run()
         peak = torch.cuda.max_memory_allocated() - before
-        parts.append(f"{peak / 2**20:.0f} MiB beside the weights")
+        parts.append(f"{peak / 2**20:.0f} MiB on top of the weights")
         name = torch.cuda.get_device_name()
         limits = [limit for part, limit in PEAK_TFLOPS.items() if part in name]
         parts += [f"{100 * achieved / limit:.0f} % of the {name}'s peak" for limit in limits]

@@ -24,7 +24,7 @@ def lay_out_results(results: Results, catalogue: Catalogue) -> Layout:
 def write_reports(
     results: Results, layout: Layout, folder: TableFolder, formats: tuple[str, ...] = FORMATS
 ) -> list[Path]:
-    """Write the reports of some formats beside the cells; returns the files, the first to read
+    """Write the reports of some formats to the table's folder; returns the files, the first to read
     last.
     """
     name = results.plan.table.name

@@ -167,11 +167,11 @@ def _score_problems(
         if name not in stated:
             yield f"{name} is not stated, computed as {again[name].value}"
             continue
-        said, found = stated[name], again.get(name, Score(None, "nothing judged it"))
-        if not _same(said.value, found.value):
-            yield f"{name} is stated as {said.value}, computed as {found.value} {found.reason}"
-        elif not _all_same(said.per_image, found.per_image):
-            yield f"{name} by image is stated as {said.per_image}, computed as {found.per_image}"
+        before, found = stated[name], again.get(name, Score(None, "nothing judged it"))
+        if not _same(before.value, found.value):
+            yield f"{name} is stated as {before.value}, computed as {found.value} {found.reason}"
+        elif not _all_same(before.per_image, found.per_image):
+            yield f"{name} by image is stated as {before.per_image}, computed as {found.per_image}"
 
 
 def _all_same(stated: Sequence[float | None], found: Sequence[float | None]) -> bool:

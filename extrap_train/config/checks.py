@@ -88,13 +88,13 @@ def _check_prep(prep: PrepConfig) -> None:
 def _check_model(model: ModelConfig) -> None:
     if model.geometry and model.family != "ours":
         raise InputError(
-            f"model.geometry=true, but model.family={model.family} is told no depth of the warp: "
-            "leave it out"
+            f"model.geometry=true: model.family={model.family} is not conditioned on the warp's "
+            "depth; leave it out"
         )
     if model.references > 1 and model.family in NEAREST_ALONE:
         raise InputError(
-            f"model.references={model.references}, but model.family={model.family} is told of the "
-            "nearest alone: give model.references=1"
+            f"model.references={model.references}: model.family={model.family} is conditioned on "
+            "the nearest alone; give model.references=1"
         )
     _check_network(model)
 
@@ -119,8 +119,8 @@ def validate_model(model: ModelConfig) -> None:
 def _check_network(model: ModelConfig) -> None:
     if model.residual and model.family == "zeronvs":
         raise InputError(
-            "model.residual=true needs a warp, which model.family=zeronvs is not told: give "
-            "model.residual=false"
+            "model.residual=true needs a warp, which model.family=zeronvs is not conditioned on; "
+            "give model.residual=false"
         )
     groups = model.unet.norm_groups
     odd = [width for width in model.unet.channels if width % groups]

@@ -23,10 +23,9 @@ class TrainerConfig:
     warmup_steps: int = option(
         100, "steps in which the learning rate rises to its full height", low=0
     )
-    full_rate_steps: int = option(
+    lr_decay_start: int = option(
         400,
-        "steps at the full learning rate, which then falls as 1/sqrt(step), so that a run can be "
-        "continued",
+        "step from which the learning rate falls as 1/sqrt(step), so that a run can be continued",
         low=1,
     )
     condition_dropout: float = option(

@@ -6,9 +6,9 @@ from typing import Any
 from extrap_train.config.options import MISSING, option, unset
 
 FAMILIES = ("zeronvs", "megascenes", "ours")
-"""What a denoiser may be told about the query view; `extrap_train.diffusion.family` has each."""
+"""What a denoiser is conditioned on; `extrap_train.diffusion.family` defines each."""
 NEAREST_ALONE = ("zeronvs", "megascenes")
-"""Families that are told of the nearest reference and of no other."""
+"""Families that are conditioned on the nearest reference alone."""
 
 
 @dataclass
@@ -88,7 +88,7 @@ class SamplerConfig:
 
 @dataclass
 class SamplerOptions:
-    """What a command says of `SamplerConfig`; null leaves it at what the model recommends."""
+    """Overrides of `SamplerConfig`; null leaves an option at what the model recommends."""
 
     solver: str | None = unset(SamplerConfig, "solver")
     steps: int | None = unset(SamplerConfig, "steps")
@@ -99,15 +99,15 @@ class SamplerOptions:
     without: list[str] = option([], "recommendations of the model to leave out", known=("compat",))
 
     def over(self, recommended: SamplerConfig) -> SamplerConfig:
-        """The model's recommendation with what is said here put over it.
+        """The model's recommendation, overridden by the options that are set here.
 
         Asked for another solver than DDIM, it leaves out what is recommended for DDIM alone.
         """
-        said = {name: value for name, value in vars(self).items() if value is not None}
-        left_out: dict[str, Any] = dict.fromkeys(said.pop("without"))
-        if said.get("solver", "ddim") != "ddim":
+        chosen = {name: value for name, value in vars(self).items() if value is not None}
+        left_out: dict[str, Any] = dict.fromkeys(chosen.pop("without"))
+        if chosen.get("solver", "ddim") != "ddim":
             left_out |= {"eta": 0.0, "compat": None}
-        return replace(recommended, **(left_out | said))
+        return replace(recommended, **(left_out | chosen))
 
 
 @dataclass
@@ -117,8 +117,8 @@ class ModelConfig:
     name: str = MISSING
     family: str = option(
         "ours",
-        "what the denoiser is told: the pose, the nearest reference's warp too, or the fused warp "
-        "with its encoding and mask",
+        "what the denoiser is conditioned on: the pose, also the nearest reference's warp, or the "
+        "fused warp with its encoding and mask",
         known=FAMILIES,
     )
     image_size: int = option(
@@ -190,5 +190,5 @@ class ModelConfig:
 
     @property
     def num_condition_views(self) -> int:
-        """`references`, and 1 for the families that are told of no more, whatever it says."""
+        """`references`, but 1 for the families of `NEAREST_ALONE`."""
         return 1 if self.family in NEAREST_ALONE else self.references

@@ -1,4 +1,4 @@
-"""Options declare themselves: what one means, its unit and its range stand beside its field."""
+"""Options declare themselves: help, unit and range stand with the field."""
 
 import copy
 import math

@@ -67,7 +67,7 @@ class SceneOptions:
         high=360,
     )
     frames: int = option(24, "views along the orbit", low=1, high=10_000)
-    painted_at_once: int = option(
+    sample_batch_size: int = option(
         16, "views denoised at a time: memory against time, same pictures", low=1, high=10_000
     )
 

@@ -140,7 +140,7 @@ class TableConfig:
         is_set=True,
     )
     reported: str | None = option(
-        None, "published numbers to print beside ours: a file of conf/reported/"
+        None, "published numbers to print next to ours: a file of conf/reported/"
     )
     output: str = option("results", "folder of all results")
     device: str = option(

@@ -153,4 +153,4 @@ def step_generator(seed: int, step: int, rank: int) -> torch.Generator:
 def rate_at(step: int, options: TrainerConfig) -> float:
     """Share of the learning rate at a step: linear warm-up, full, then falling as 1/√step."""
     warm = min(1.0, (step + 1) / max(1, options.warmup_steps))
-    return warm * min(1.0, (options.full_rate_steps / max(1, step)) ** 0.5)
+    return warm * min(1.0, (options.lr_decay_start / max(1, step)) ** 0.5)

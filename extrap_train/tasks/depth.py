@@ -28,7 +28,7 @@ from extrap_train.tasks.scene_model import open_model
 from extrap_train.terminal import progress, terminal
 
 EXAMPLES_PER_CAPTURE = 16
-_TRAINER_OPTIONS = ("batch_size", "warmup_steps", "full_rate_steps", "ema_decay")
+_TRAINER_OPTIONS = ("batch_size", "warmup_steps", "lr_decay_start", "ema_decay")
 """What a run depends on; steps and checkpoints may change when it is continued."""
 
 

@@ -194,7 +194,7 @@ def scene_generator(config: TrainConfig, model: ExtrapolationModel) -> Diffusion
     """The generator of every task about a scene: sampler and precision as the options say."""
     sampler = sampler_for(config.sampler, model.config)
     return DiffusionGenerator(
-        model, sampler, config.painted_at_once, precision=config.trainer.precision
+        model, sampler, config.sample_batch_size, precision=config.trainer.precision
     )
 
 
@@ -206,7 +206,7 @@ def generate_views(
     config: TrainConfig,
 ) -> GeneratedViews:
     """The generator's views; InputError that says which option to change where memory ends."""
-    with advise_on_sampling_memory(config.painted_at_once, config.trainer):
+    with advise_on_sampling_memory(config.sample_batch_size, config.trainer):
         return generator.generate(views, cameras, names, config.seed)
 
 

@@ -84,7 +84,7 @@ def test_training_on_one_batch_lowers_its_loss(config: ModelConfig, batch: PairB
 
 
 def test_the_rate_warms_up_stays_and_falls_as_the_inverse_root() -> None:
-    options = TrainerConfig(warmup_steps=10, full_rate_steps=100)
+    options = TrainerConfig(warmup_steps=10, lr_decay_start=100)
     assert rate_at(0, options) == pytest.approx(0.1)
     assert rate_at(9, options) == rate_at(100, options) == 1
     assert rate_at(400, options) == pytest.approx(0.5)

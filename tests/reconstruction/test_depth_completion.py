@@ -162,7 +162,7 @@ def stored(tmp_path_factory) -> StoredExamples:
 
 def test_a_tiny_network_learns_the_back_of_the_ball(stored, tmp_path):
     """Measured from an angle that is not among the examples, most of it where no input looks."""
-    options = TrainerConfig(batch_size=4, warmup_steps=5, ema_decay=0.8, full_rate_steps=1000)
+    options = TrainerConfig(batch_size=4, warmup_steps=5, ema_decay=0.8, lr_decay_start=1000)
     training = DepthTraining(options, 0, TINY)
     for _ in range(20):
         training.advance(stored)

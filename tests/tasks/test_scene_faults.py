@@ -55,9 +55,9 @@ def test_memory_that_ends_in_painting_is_one_line(
 
     monkeypatch.setattr("extrap_train.diffusion.generator.sample_views", sampled)
     walk = ["task=view", f"weights={weights}", "orbit=90", "frames=3"]
-    assert "give painted_at_once=8" in refused(*walk)
-    assert "give painted_at_once=8" in refused(*_SHORT, f"weights={weights}")
-    command(*walk, "painted_at_once=2")
+    assert "give sample_batch_size=8" in refused(*walk)
+    assert "give sample_batch_size=8" in refused(*_SHORT, f"weights={weights}")
+    command(*walk, "sample_batch_size=2")
     assert len(list((tmp_path / "view" / "hydrant-0000" / "views").iterdir())) == 6
 
 
