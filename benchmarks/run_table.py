@@ -164,12 +164,9 @@ def _make(jobs: Sequence[CellJob], making: Making, folder: TableFolder) -> list[
             size = scene.record.image_size
             output = check_output(result, len(scene.draw.targets), size, job.method.name)
             cells[index] = keep_output(job, output, truths_apart=True)
-            bar.advance(note=f"{job.method.name} {_word(cells[index])}")
+            reason = f": {cells[index].reason}" if cells[index].status == FAILED else ""
+            bar.advance(note=f"{job.method.name} {cells[index].status}{reason}")
     return [cells[index] for index in range(len(jobs))]
-
-
-def _word(cell: Cell) -> str:
-    return cell.status if cell.status != FAILED else f"failed: {cell.reason}"
 
 
 def _score(jobs: Sequence[CellJob], launcher: Launcher) -> list[Cell]:

@@ -156,14 +156,11 @@ def _sections(options: CommandOptions) -> Iterator[tuple[str, list[Option]]]:
 
 
 def _row(option: Option) -> tuple[str, str]:
-    limits = ", ".join(filter(None, [option.declared.unit, *_limits(option)]))
+    values = " | ".join(option.declared.known) or option.range
+    limits = ", ".join(filter(None, [option.declared.unit, values]))
     return f"{option.name}={_shown(option.default)}", option.declared.help + (
         f" ({limits})" if limits else ""
     )
-
-
-def _limits(option: Option) -> list[str]:
-    return [" | ".join(option.declared.known)] if option.declared.known else [option.range]
 
 
 def _shown(value: Any) -> str:

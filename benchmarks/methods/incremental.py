@@ -45,9 +45,11 @@ class IncrementalDiffusion(Diffusion):
         queries = [Query(name, cameras[index]) for index, name in enumerate(names)]
         steps: list[Step] = []
         known = complete(known, queries, workshop, lambda _, __, step: steps.append(step))
+        # Of every view the attempt that the map kept, as it was painted.
+        seeds = {v.view.name: v.origin.seed for v in known.views if v.origin.kind == GENERATED}
         agreeing = [s for s in steps if s.agreement >= options.confidence.least_agreement]
         return Synthesis(
-            images=_kept(painter, known, names),
+            images=torch.stack([painter.pictures[name, seeds[name]] for name in names]),
             given={"references": "inputs and painted views", "painted views' depth": "stereo"},
             points=_points(known, world, options),
             counts={
@@ -84,14 +86,6 @@ class _Remembering:
             {(name, seed): image for name, image in zip(names, made.images, strict=True)}
         )
         return made
-
-
-def _kept(
-    painter: _Remembering, known: GlobalMap, names: Sequence[str]
-) -> Float[Tensor, "n 3 h w"]:
-    """Of every view the attempt that the map kept, as it was painted."""
-    seeds = {v.view.name: v.origin.seed for v in known.views if v.origin.kind == GENERATED}
-    return torch.stack([painter.pictures[name, seeds[name]] for name in names])
 
 
 def _points(known: GlobalMap, world: WorldFrame, options: CompletionConfig) -> Float[Tensor, "m 3"]:

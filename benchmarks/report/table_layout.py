@@ -153,12 +153,10 @@ def _panel(
         )
         for method, entry in results.methods.items()
     ]
-    return Panel(f"{title} ({_counted_captures(captures)})", columns, rows)
-
-
-def _counted_captures(count: int) -> str:
-    many = f"{count} capture{'s' if count > 1 else ''}"
-    return many if count >= FEWEST_CAPTURES else f"{many}: too few to tell methods apart"
+    counted = f"{captures} capture{'s' if captures > 1 else ''}"
+    if captures < FEWEST_CAPTURES:
+        counted += ": too few to tell methods apart"
+    return Panel(f"{title} ({counted})", columns, rows)
 
 
 def _entry(mean: Any, metric: str) -> Entry:
@@ -200,13 +198,14 @@ def _reported(content: dict[str, Any]) -> Panel:
             for n, numbers in by_views.items()
             for metric, value in zip(content["metrics"], numbers, strict=True)
         }
-        entries = [_stated(values.get(column), column[0]) for column in columns]
+        entries = [
+            Entry("–", None)
+            if (value := values.get(column)) is None
+            else Entry(_number(value, column[0]), value)
+            for column in columns
+        ]
         rows.append(Row(f"{label} (reported)", "", entries))
     return Panel(f"Reported, not measured here: {content['source']}", columns, rows)
-
-
-def _stated(value: float | None, metric: str) -> Entry:
-    return Entry("–", None) if value is None else Entry(_number(value, metric), value)
 
 
 def _missing(results: Results) -> list[str]:

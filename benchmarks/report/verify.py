@@ -170,12 +170,10 @@ def _score_problems(
         before, found = stated[name], again.get(name, Score(None, "nothing judged it"))
         if not _same(before.value, found.value):
             yield f"{name} is stated as {before.value}, computed as {found.value} {found.reason}"
-        elif not _all_same(before.per_image, found.per_image):
+        elif len(before.per_image) != len(found.per_image) or not all(
+            map(_same, before.per_image, found.per_image)
+        ):
             yield f"{name} by image is stated as {before.per_image}, computed as {found.per_image}"
-
-
-def _all_same(stated: Sequence[float | None], found: Sequence[float | None]) -> bool:
-    return len(stated) == len(found) and all(map(_same, stated, found))
 
 
 def _same(stated: float | None, found: float | None) -> bool:

@@ -53,7 +53,9 @@ def run_method(job: CellJob) -> bytes:
     try:
         inputs = Scene.open(job.scene).inputs()
         with PeakMemory() as memory, Stopwatch() as watch:
-            synthesis = _synthesize(job.method, inputs)
+            for seed in (random.seed, np.random.seed, torch.manual_seed):
+                seed(inputs.seed)
+            synthesis = build_method(job.method).synthesize(inputs)
         return _packed(synthesis, inputs, job.method, watch.seconds, memory.mib)
     except Unavailable as error:
         return pack_output(MethodOutput(status=UNAVAILABLE, reason=str(error)))
@@ -104,12 +106,6 @@ def _typed_options(config: MethodConfig, factory: Any) -> dict[str, Any]:
     return values
 
 
-def _synthesize(method: MethodConfig, inputs: SceneInputs) -> Synthesis:
-    for seed in (random.seed, np.random.seed, torch.manual_seed):
-        seed(inputs.seed)
-    return build_method(method).synthesize(inputs)
-
-
 def _packed(
     synthesis: Synthesis,
     inputs: SceneInputs,
@@ -124,9 +120,11 @@ def _packed(
     if points is not None:
         _require_floats(points, f"method {method.name}: points")
         arrays["points"] = points.detach().cpu().float().numpy()
+    assert isinstance(inputs.depth_source, RecordedDepth)
+    sharing = len(inputs.targets.world_to_cam) if method.time == PER_IMAGE else 1
     values = {
         "status": MADE,
-        "seconds": synthesis.seconds + _depth_share(inputs, method),
+        "seconds": synthesis.seconds + inputs.depth_source.seconds / sharing,
         "wall_seconds": wall_seconds,
         "peak_memory_mib": peak_memory_mib,
         "given": dict(synthesis.given),
@@ -170,13 +168,6 @@ def _require_floats(values: Any, what: str) -> None:
     if not (isinstance(values, Tensor) and values.is_floating_point()):
         kind = values.dtype if isinstance(values, Tensor) else type(values).__name__
         raise InputError(f"{what} must be a tensor of floats, not {kind}")
-
-
-def _depth_share(inputs: SceneInputs, method: MethodConfig) -> float:
-    """What finding the inputs' depth took, for the methods that asked for it."""
-    assert isinstance(inputs.depth_source, RecordedDepth)
-    count = len(inputs.targets.world_to_cam) if method.time == PER_IMAGE else 1
-    return inputs.depth_source.seconds / count
 
 
 _MAX_TRACEBACK_LINES = 200

@@ -27,8 +27,10 @@ def validate(config: TrainConfig | DataPrepConfig) -> None:
     _check_prep(config.prep)
     if isinstance(config.data, Co3dConfig) and not config.data.root:
         raise InputError("data=co3d needs the folder of the download: give data.root=FOLDER")
-    if config.data.root and isinstance(config.data, Co3dConfig):
-        _check_folder(config.data.root)
+    root = config.data.root
+    if root and isinstance(config.data, Co3dConfig) and not Path(root).is_dir():
+        # Before anything is written: a wrong root must not leave a run behind.
+        raise InputError(f"data.root={root}: no such folder; give the folder of the download")
     _check_files(config)
     if isinstance(config, TrainConfig):
         _check_intervals(config.trainer)
@@ -36,7 +38,10 @@ def validate(config: TrainConfig | DataPrepConfig) -> None:
         if config.task in PAIR_TASKS:
             _check_pairs(config.model, config.prep)
         _check_completion(config)
-        _check_sampler_of(config)
+        if config.weights is None:
+            sampler_for(config.sampler, config.model)
+        else:  # what other weights recommend is known when they are read
+            check_sampler(config.sampler.over(SamplerConfig()))
         if config.lora.virtual_references == 1:
             raise InputError(
                 "lora.virtual_references=1: one per input is held out; give 2 or more, or 0 "
@@ -167,26 +172,12 @@ def _check_intervals(trainer: TrainerConfig) -> None:
         )
 
 
-def _check_sampler_of(config: TrainConfig) -> None:
-    """What other weights than the configured model's recommend is known when they are read."""
-    if config.weights is None:
-        sampler_for(config.sampler, config.model)
-    else:
-        check_sampler(config.sampler.over(SamplerConfig()))
-
-
 def _check_completion(config: TrainConfig) -> None:
     named = len(config.input_frames)
     if config.task == "complete" and (named or config.inputs) == 1:
         raise InputError(
             "one photograph does not show where its surfaces are; give at least two (inputs=3)"
         )
-
-
-def _check_folder(root: str) -> None:
-    """Before anything is written: a wrong root must not leave a run behind."""
-    if not Path(root).is_dir():
-        raise InputError(f"data.root={root}: no such folder; give the folder of the download")
 
 
 def sampler_for(options: SamplerOptions, model: ModelConfig) -> SamplerConfig:

@@ -3,7 +3,7 @@
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from lightning.fabric import Fabric
@@ -81,7 +81,10 @@ def run(config: TrainConfig) -> Outcome:
     folder, used = result_folder(config, label_of(sequence)), UsedWeights.of(config)
     read = _frames_read(config, sequence)
     options = _options(config) | model_options(config)
-    manifest = scene_manifest(config, read, used.inputs() | _lpips_digest(config), options)
+    digests, lpips = used.inputs(), config.validation.lpips_weights
+    if lpips is not None:
+        digests["weights of LPIPS"] = file_digest(Path(lpips))
+    manifest = scene_manifest(config, read, digests, options)
     with nothing_kept(), claim(folder, manifest, resume=config.resume) as result:
         is_reused = result.is_reused and _is_whole(folder)
         if is_reused:
@@ -102,7 +105,8 @@ def _run(
         inputs.views, model.config.num_condition_views, config.lora.virtual_references, config.seed
     )
     sampler = sampler_for(config.sampler, model.config)
-    targets = _targets(config, inputs, model)
+    measured_on = linspace_indices(len(inputs.others), config.validation.examples)
+    targets = target_views([inputs.others[i] for i in measured_on], model.config.image_size)
     before = _generate(model, config, inputs, targets)
     if config.trainer.gradient_checkpointing:
         model.unet.enable_gradient_checkpointing()
@@ -123,7 +127,11 @@ def _run(
             sampler,
             seconds=60 * config.minutes,
             seed=config.seed,
-            fabric=_fabric(config),
+            fabric=Fabric(
+                accelerator=config.trainer.accelerator,
+                devices=1,
+                precision=cast(Any, trainer_precision(config.trainer)),
+            ),
             on_step=on_step,
         )
     after = _generate(model, config, inputs, targets)
@@ -143,17 +151,6 @@ def _frames_read(config: TrainConfig, sequence: FrameSequence) -> list[Frame]:
     names = {frame.name for frame in inputs}
     others = [frame for frame in sequence.frames if frame.name not in names]
     return inputs + [others[i] for i in linspace_indices(len(others), config.validation.examples)]
-
-
-def _lpips_digest(config: TrainConfig) -> dict[str, str]:
-    path = config.validation.lpips_weights
-    return {} if path is None else {"weights of LPIPS": file_digest(Path(path))}
-
-
-def _fabric(config: TrainConfig) -> Fabric:
-    """Device and precision of the training."""
-    precision: Any = trainer_precision(config.trainer)
-    return Fabric(accelerator=config.trainer.accelerator, devices=1, precision=precision)
 
 
 def _options(config: TrainConfig) -> dict[str, Any]:
@@ -201,11 +198,6 @@ def _is_whole(folder: Path) -> bool:
         terminal(stderr=True).print(f"{error}: adapting again")
         return False
     return True
-
-
-def _targets(config: TrainConfig, inputs: SceneInputs, model: ExtrapolationModel) -> list[View]:
-    chosen = linspace_indices(len(inputs.others), config.validation.examples)
-    return target_views([inputs.others[i] for i in chosen], model.config.image_size)
 
 
 def _generate(

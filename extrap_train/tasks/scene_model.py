@@ -54,11 +54,15 @@ class UsedWeights:
         path, adapter = Path(name), config.adapter and Path(config.adapter)
         if adapter and not adapter.is_dir():
             raise InputError(f"adapter={adapter}: no such folder; give an adapter of task=scene")
+        run, steps = RunFolder(path.parent), packaged_steps(name)
+        if path.exists():
+            is_of_run = path == run.model and run.summary.is_file()
+            steps = Finished.read(run).steps if is_of_run else None
         return cls(
             name=name,
             sha256=weights_digest(_folder_of(name)),
             is_packaged=not path.exists(),
-            steps=_steps_of(path) if path.exists() else packaged_steps(name),
+            steps=steps,
             adapter=str(adapter.resolve()) if adapter else None,
             adapter_sha256=folder_digest(adapter) if adapter else None,
         )
@@ -80,12 +84,6 @@ def model_options(config: TrainConfig) -> dict[str, Any]:
     if is_own(_folder_of(named_weights(config))):
         return {}
     return dotted({"model": asdict(config.model)})
-
-
-def _steps_of(model: Path) -> int | None:
-    """Of a run's model, from the run's summary."""
-    run = RunFolder(model.parent)
-    return Finished.read(run).steps if model == run.model and run.summary.is_file() else None
 
 
 def trained_model(config: TrainConfig) -> ExtrapolationModel:
