@@ -17,8 +17,6 @@ PERF_NAMES = ("align", "gaussians", "prep", "sample", "train", "warp")
 KINDS = ("methods", "tables", "categories")
 FORMATS = ("csv", "md", "latex", "html")
 
-Command = Callable[[argparse.Namespace], int]
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status."""
