@@ -95,13 +95,18 @@ def _once_there(target: Callable[[], int | None], run: subprocess.Popen[bytes]) 
     return pid
 
 
-def _a_worker(parent: int) -> int | None:
-    """One that lives: not multiprocessing's tracker of resources, nor one that has ended."""
-    for pid in Path(f"/proc/{parent}/task/{parent}/children").read_text().split():
-        try:
-            command = Path(f"/proc/{pid}/cmdline").read_bytes()
-        except OSError:
-            continue
-        if b"spawn_main" in command:
-            return int(pid)
+def _a_worker(run: int) -> int | None:
+    """A guest: the run's server has forked its keeper, and the keeper has forked it."""
+    for server in _children(run):
+        for keeper in _children(server):
+            for guest in _children(keeper):
+                return guest
     return None
+
+
+def _children(process: int) -> list[int]:
+    try:
+        found = Path(f"/proc/{process}/task/{process}/children").read_text()
+    except OSError:
+        return []
+    return [int(pid) for pid in found.split()]
