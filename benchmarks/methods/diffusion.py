@@ -31,6 +31,7 @@ from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.packaged import packaged_name, packaged_weights
 from extrap_train.errors import InputError
+from extrap_train.store.digests import files_below
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ class Diffusion:
 
     def weight_files(self, category: str) -> Sequence[Path]:
         """The files of the model's folder."""
-        return sorted(path for path in self._folder(category).rglob("*") if path.is_file())
+        return list(files_below(self._folder(category)))
 
     def synthesize(self, inputs: SceneInputs) -> Synthesis:
         """Paint every target; the time is that of a single image, its share of all that the scene

@@ -3,6 +3,7 @@
 import hashlib
 import os
 import time
+from collections.abc import Iterator, Set
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,10 +49,29 @@ def file_digest(path: Path) -> str:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
 
 
+def files_below(folder: Path, above: Set[Path] = frozenset()) -> Iterator[Path]:
+    """All files below a folder, sorted; links are followed, but not back to a folder `above`.
+
+    Raises InputError where a folder cannot be read.
+    """
+    here = folder.resolve()
+    if here in above:
+        return
+    try:
+        entries = sorted(folder.iterdir())
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read ({error.strerror})") from None
+    for path in entries:
+        if path.is_dir():
+            yield from files_below(path, {*above, here})
+        elif path.is_file():
+            yield path
+
+
 def folder_digest(folder: Path) -> str:
     """SHA-256 of the names and contents of all files below a folder, wherever it lies."""
     digest = hashlib.sha256()
-    for path in sorted(p for p in folder.rglob("*") if p.is_file()):
+    for path in files_below(folder):
         digest.update(f"{path.relative_to(folder).as_posix()}\0{file_digest(path)}\n".encode())
     return digest.hexdigest()
 

@@ -93,6 +93,15 @@ def _with_other_photograph(inputs: SceneInputs, index: int) -> SceneInputs:
     return replace(inputs, views=changed(inputs.views), fine_views=changed(inputs.fine_views))
 
 
+def test_its_weight_files_are_also_those_that_a_link_leads_to(tmp_path: Path) -> None:
+    (tmp_path / "unet").mkdir()
+    (tmp_path / "unet" / "weights").touch()
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / "unet").symlink_to(tmp_path / "unet")
+    files = Diffusion(weights=str(tmp_path / "model")).weight_files("analytic")
+    assert files == [tmp_path / "model" / "unet" / "weights"]
+
+
 @each_variant
 def test_it_paints_the_targets_and_repeats_itself(name: str, weights: str) -> None:
     inputs, truth = scene_inputs(size=40)  # other than the model's: it is resampled

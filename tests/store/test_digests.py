@@ -8,7 +8,7 @@ import pytest
 
 from extrap_train.errors import InputError
 from extrap_train.store import digests
-from extrap_train.store.digests import file_digest, folder_digest
+from extrap_train.store.digests import file_digest, files_below, folder_digest
 
 
 @pytest.fixture
@@ -87,6 +87,30 @@ def test_a_folder_is_its_names_and_contents(tmp_path: Path) -> None:
     found = {name: folder_digest(tmp_path / name) for name in ("a", "b", "c", "d")}
     assert found["a"] == found["d"]
     assert len({found[name] for name in ("a", "b", "c")}) == 3
+
+
+@pytest.mark.parametrize("name", ["unet", "vae/deep", "weights"])
+def test_a_folder_is_also_what_its_links_lead_to(tmp_path: Path, name: str) -> None:
+    linked, copied = tmp_path / "linked" / name, tmp_path / "copied" / name
+    for folder in (tmp_path / "elsewhere", copied):
+        folder.mkdir(parents=True)
+        (folder / "weights").write_bytes(b"one")
+    linked.parent.mkdir(parents=True)
+    linked.symlink_to(tmp_path / "elsewhere")
+    before = folder_digest(tmp_path / "linked")
+    assert before == folder_digest(tmp_path / "copied")
+    (tmp_path / "elsewhere" / "weights").write_bytes(b"two")
+    assert folder_digest(tmp_path / "linked") != before
+
+
+def test_links_that_lead_in_circles_end(tmp_path: Path) -> None:
+    for name, other in (("a", "b"), ("b", "a")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "weights").touch()
+        (tmp_path / name / "other").symlink_to(tmp_path / other)
+    (tmp_path / "a" / "self").symlink_to(tmp_path / "a")
+    found = [path.relative_to(tmp_path / "a").as_posix() for path in files_below(tmp_path / "a")]
+    assert found == ["other/weights", "weights"]
 
 
 def test_what_is_no_file_is_one_line(tmp_path: Path) -> None:
