@@ -4,7 +4,7 @@ Every capture passes the second check when it is opened, whatever the task. Pose
 convention look sound one by one; together they stand in one place, or look away from each other.
 """
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -48,6 +48,13 @@ FOCAL_SIDES = (1e-3, 1e4)
 CENTRE_SIDES = 1e3
 """How far outside of the picture the principal point of a crop may lie, in its sides."""
 
+SHORTEST_FOCAL, LONGEST_FOCAL = 0.2, 20.0
+"""Of a photograph: in its shorter side, which a circular fisheye fills, and in its longer one."""
+LARGEST_OFFSET = 0.25
+"""Of a photograph's principal point from its middle, as a share of each side."""
+NORMALISED_FOCAL = 5.0
+"""In pixels: a photograph's focal length below it is one in widths."""
+
 
 def is_degenerate(camera: Camera) -> Bool[Tensor, "*b"]:
     """Whether a camera is not finite, has no rotation, or a lens that no camera has."""
@@ -62,6 +69,31 @@ def is_degenerate(camera: Camera) -> Bool[Tensor, "*b"]:
     return ~(finite & (deviation < ROTATION_TOLERANCE) & right_handed & plausible & centred)
 
 
+def is_photographs(camera: Camera) -> Bool[Tensor, "*b"]:
+    """Whether a camera is sound, with a lens that fits a whole photograph of its size."""
+    size = camera.intrinsics.new_tensor([camera.width, camera.height])
+    focal = camera.intrinsics.diagonal(dim1=-2, dim2=-1)[..., :2]
+    fits = (focal >= SHORTEST_FOCAL * size.min()) & (focal <= LONGEST_FOCAL * size.max())
+    centred = (camera.intrinsics[..., :2, 2] / size - 0.5).abs() <= LARGEST_OFFSET
+    return ~is_degenerate(camera) & (fits & centred).all(-1)
+
+
+def _lens_fault(camera: Camera) -> str:
+    """What to say of a sound camera whose lens fits no photograph of its size."""
+    (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
+    if min(fx, fy) < NORMALISED_FOCAL or (0 < cx <= 1 and 0 < cy <= 1):
+        cause = "they look normalised: multiply fx and cx by the width, fy and cy by the height"
+    else:
+        cause = (
+            "are they those of another size, or is an angle in another unit (camera_angle_x is in "
+            "radians, x_fov in degrees)? Correct them"
+        )
+    return (
+        f"intrinsics (fx {fx:.4g}, fy {fy:.4g}, cx {cx:.4g}, cy {cy:.4g} pixels) do not fit a "
+        f"picture of {camera.width} x {camera.height} pixels; {cause}"
+    )
+
+
 def degenerate_camera(name: str, file: Path) -> str:
     """What to say of one that was read from `file`."""
     return (
@@ -70,11 +102,12 @@ def degenerate_camera(name: str, file: Path) -> str:
     )
 
 
-def require_sound(cameras: Camera, names: Collection[str], file: Path) -> None:
-    """Raise InputError that names the first degenerate camera of those read from `file`."""
-    for name, degenerate in zip(names, is_degenerate(cameras).tolist(), strict=True):
-        if degenerate:
-            raise InputError(degenerate_camera(name, file))
+def require_sound(camera: Camera, name: str, file: Path) -> None:
+    """Raise InputError where the camera of a photograph, read from `file`, cannot be used."""
+    if is_degenerate(camera):
+        raise InputError(degenerate_camera(name, file))
+    if not is_photographs(camera):
+        raise InputError(f"{file}: {name}: {_lens_fault(camera)}")
 
 
 Reread = Callable[[Float[Tensor, "n 4 4"]], Float[Tensor, "n 4 4"]]

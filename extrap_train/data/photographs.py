@@ -25,7 +25,7 @@ from extrap_train.data.picture_files import image_size, same_view
 from extrap_train.data.sequences import Frame, FrameSequence, PointCloud
 from extrap_train.errors import InputError
 from extrap_train.geometry.lens import Lens, undistort
-from extrap_train.views import Camera, View, stack_cameras, stack_poses
+from extrap_train.views import Camera, View, stack_poses
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,13 +265,13 @@ def _frame(root: Path, photo: Photograph, name: str, description: Path) -> Frame
 
 
 def pinhole_camera(photo: Photograph, description: Path) -> tuple[Lens, Camera]:
-    """The camera of a photograph once its lens is undone; InputError where it is degenerate."""
+    """The camera of a photograph once its lens is undone; InputError where it cannot be used."""
     lens = photo.lens
     if not all(np.isfinite([*lens.matrix.flat, *lens.distortion, lens.radial_r8])):
         raise InputError(f"{description}: the lens of {photo.image_path} is not finite; correct it")
     straight = _camera(photo, replace(lens, distortion=(), fisheye=False, radial_r8=0.0))
     # First, or the distortion would be blamed for a focal length of 0.
-    require_sound(stack_cameras([straight]), [photo.image_path], description)
+    require_sound(straight, photo.image_path, description)
     try:
         pinhole = lens.pinhole(photo.height, photo.width)
     except ValueError as error:

@@ -9,7 +9,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from extrap_train.data.camera_check import is_degenerate
 from extrap_train.data.sequences import Frame
 from extrap_train.depth import RELIABLE_CONFIDENCE, DepthSource
 from extrap_train.errors import InputError
@@ -30,10 +29,6 @@ ONE_SIDED_STEP_RAD = np.radians(25)
 """Wanted between neighbouring inputs that stand on one side."""
 SAME_POSE_RAD = np.radians(0.5)
 LOOKS_AT_RAD = np.radians(45)
-CENTRED_SHARE = 0.25
-"""Largest offset of the principal point from the image's middle, as a share of its side."""
-FOCAL_RANGE = (0.2, 20.0)
-"""Of focal lengths, in image widths."""
 WORKING_SIDE = 512
 """Photographs are not looked at more closely than this many pixels a side."""
 
@@ -88,10 +83,6 @@ def check_cameras(cameras: Sequence[Camera], names: Sequence[str]) -> None:
         raise InputError(
             "one photograph does not show where its surfaces are; give at least two (inputs=3)"
         )
-    for camera, name in zip(cameras, names, strict=True):
-        if bool(is_degenerate(camera)):
-            raise InputError(f"{name}: its camera is degenerate; correct the pose")
-        _check_lens(camera, name)
     poses = stack_poses(list(cameras))
     center = scene_center(poses)
     seen = facing(poses, center, LOOKS_AT_RAD)
@@ -119,20 +110,6 @@ def stand_where(
     """Which of the others stand where an (unbatched) camera does, as seen from the scene."""
     poses = [camera, *(others[i] for i in range(len(others.world_to_cam)))]
     return pairwise_angles(stack_poses(poses), center)[0, 1:] < SAME_POSE_RAD
-
-
-def _check_lens(camera: Camera, name: str) -> None:
-    k = camera.intrinsics
-    offset = max(
-        abs(float(k[0, 2]) / camera.width - 0.5), abs(float(k[1, 2]) / camera.height - 0.5)
-    )
-    focal = float(k[0, 0]) / camera.width
-    if offset > CENTRED_SHARE or not FOCAL_RANGE[0] <= focal <= FOCAL_RANGE[1]:
-        raise InputError(
-            f"{name}: intrinsics (fx {float(k[0, 0]):.1f}, cx {float(k[0, 2]):.1f}, cy "
-            f"{float(k[1, 2]):.1f}) do not fit an image of {camera.width} x {camera.height} "
-            "pixels; are they those of another size?"
-        )
 
 
 def first_views(

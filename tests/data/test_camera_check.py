@@ -1,6 +1,7 @@
 """Poses in another convention are found by what the cameras of a capture look at together."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,10 @@ from extrap_train.data.camera_check import (
     COLMAP_POSES,
     OPENGL_POSES,
     find_pose_fault,
+    is_photographs,
+    require_sound,
 )
+from extrap_train.errors import InputError
 from extrap_train.geometry.opengl import (
     opengl_from_world_to_cam,
     rigid_inverse,
@@ -110,3 +114,49 @@ def test_cameras_in_one_place_are_refused(name, cameras):
 def test_cameras_that_look_apart_are_refused(convention):
     away = orbit().center.numpy()
     assert "nothing in common" in find_pose_fault(looking(away, 3 * away), convention)
+
+
+def with_lens(width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> Camera:
+    intrinsics = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float32)
+    return replace(orbit_camera(0), intrinsics=intrinsics, width=width, height=height)
+
+
+def with_angle(width: int, height: int, angle_deg: float) -> Camera:
+    focal = width / 2 / np.tan(np.radians(angle_deg) / 2)
+    return with_lens(width, height, focal, focal, width / 2, height / 2)
+
+
+PHOTOGRAPHS = {
+    "telephoto": with_angle(4000, 3000, 5),
+    "upright telephoto": with_angle(3000, 4000, 5),
+    "action camera": with_angle(1920, 1080, 122),
+    "circular fisheye": with_lens(1920, 1080, 1080 / 3.4, 1080 / 3.4, 960, 540),
+    "panorama": with_lens(4000, 1000, 900, 900, 2000, 500),
+    "shifted lens": with_lens(640, 480, 600, 600, 240, 300),
+}
+
+
+@pytest.mark.parametrize("name", PHOTOGRAPHS)
+def test_lenses_of_photographs_pass(name):
+    assert is_photographs(PHOTOGRAPHS[name])
+    require_sound(PHOTOGRAPHS[name], name, Path("cameras.json"))
+
+
+@pytest.mark.parametrize(
+    ("camera", "cause"),
+    [
+        (with_lens(96, 96, 1.17, 1.17, 0.5, 0.5), "normalised"),
+        (with_lens(96, 96, 1.17, 1.17, 48, 48), "normalised"),
+        (with_lens(640, 480, 600, 600, 0.5, 0.5), "normalised"),
+        (with_lens(96, 96, 112, 112, 0, 0), "another size"),
+        (with_lens(24, 24, 60, 60, 24, 24), "another size"),
+        (with_angle(96, 96, 0.81), "x_fov in degrees"),
+        (with_angle(96, 96, np.degrees(2.5)), "camera_angle_x is in radians"),
+    ],
+)
+def test_lenses_that_fit_no_photograph_are_refused_with_the_likely_cause(camera, cause):
+    assert not is_photographs(camera)
+    with pytest.raises(InputError, match=cause) as caught:
+        require_sound(camera, "one.png", Path("cameras.json"))
+    assert str(caught.value).startswith("cameras.json: one.png: ")
+    assert "\n" not in str(caught.value)

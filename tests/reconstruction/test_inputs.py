@@ -59,12 +59,6 @@ def test_views_that_see_nothing_in_common_are_refused():
         check_cameras([*cameras(-30, 0), replace(away, world_to_cam=turned)], NAMES)
 
 
-def test_intrinsics_of_another_size_are_refused():
-    small = [replace(camera, height=24, width=24) for camera in cameras(-30, 0, 30)]
-    with pytest.raises(InputError, match=r"a: intrinsics .* do not fit an image of 24 x 24"):
-        check_cameras(small, NAMES)
-
-
 def bumpy(camera: Camera) -> View:
     """A view of a plane with corners to match: blocks of random grey in space."""
     origins, directions = scenes.rays(camera)
