@@ -28,20 +28,21 @@ from benchmarks.run.cells import (
     score_cell,
     write_failure,
 )
-from benchmarks.run.identity import MISSING_WEIGHTS
+from benchmarks.run.method_content import MISSING_WEIGHTS, is_ours, method_contents
 from benchmarks.run.plan import (
     OpenJobs,
     TableFolder,
     cell_jobs,
+    device_of,
     open_jobs,
     open_protocol,
     prepare_draws,
     require_different,
     selected_draws,
 )
-from benchmarks.run.run_method import build_method, check_output, run_method
+from benchmarks.run.run_method import check_output, run_method
 from benchmarks.score.scoring import missing_networks
-from extrap_train.config import TableConfig
+from extrap_train.config import MethodConfig, TableConfig
 from extrap_train.errors import InputError
 from extrap_train.jobs import Died, Launcher
 from extrap_train.jobs.guests import AsGuest, GuestLauncher
@@ -107,17 +108,18 @@ def _run(
 ) -> int:
     configs = [catalogue.method(name, table.options.get(name)) for name in table.methods]
     require_different(configs)
-    methods = {config.name: (config, build_method(config)) for config in configs}
-    if not methods:
+    if not configs:
         raise InputError("the table has no methods: give methods=[...]")
     protocol, captures = open_protocol(table, folder, configs)
     draws = selected_draws(table, protocol, options.quick)
+    guests = _guests(configs, table, options)
+    contents = method_contents(configs, {draw.category for draw in draws}, guests)
     scenes: list[Scene] = []
     with progress("preparing", len(draws), "draws") as bar:
         for scene in prepare_draws(table, folder, draws, captures):
             scenes.append(scene)
             bar.advance()
-    jobs = cell_jobs(table, folder, protocol, methods, scenes)
+    jobs = cell_jobs(table, folder, protocol, configs, contents, scenes)
     left = open_jobs(jobs, folder, console.print)
     still = len(left.to_make) + len(left.to_score)
     console.print(f"{len(jobs)} cells: {len(left.done)} reused, {still} open")
@@ -133,7 +135,7 @@ def _run(
         cells=[job.folder.name for job in jobs],
     )
     try:
-        with _launchers(options, table, jobs, folder) as (making, scoring):
+        with _launchers(guests, options, table, jobs, folder) as (making, scoring):
             made = _make(left.to_make, making, folder)
             images = [
                 replace(job, images_from=job.folder)
@@ -203,23 +205,32 @@ def _report(
     return sum(cell.status == FAILED for cell in results.cells)
 
 
+def _guests(
+    configs: Sequence[MethodConfig], table: TableConfig, options: RunOptions
+) -> GuestLauncher:
+    """What runs the methods' code, each time in a process of its own."""
+    ours = {config.factory.rpartition(".")[0] for config in configs if is_ours(config)}
+    preload = ("benchmarks.run.run_method", *sorted(ours))
+    cores = 1 if device_of(table) == "cuda" else len(os.sched_getaffinity(0))
+    return GuestLauncher(options.workers or cores, table.cell_timeout_s, preload)
+
+
 @contextmanager
 def _launchers(
-    options: RunOptions, table: TableConfig, jobs: Sequence[CellJob], folder: TableFolder
+    guests: GuestLauncher,
+    options: RunOptions,
+    table: TableConfig,
+    jobs: Sequence[CellJob],
+    folder: TableFolder,
 ) -> Iterator[tuple[Making, Launcher]]:
     """What makes images, each cell's in a process of its own, and what scores them."""
-    modules = {job.method.factory.rpartition(".")[0] for job in jobs}
-    ours = sorted(name for name in modules if name.startswith("benchmarks."))
-    preload = ("benchmarks.run.run_method", *ours)
     if options.launcher is not None or options.slurm:
         elsewhere = options.launcher or slurm_launcher(table.slurm, folder.path / "slurm")
-        yield partial(elsewhere.run, AsGuest(run_method, table.cell_timeout_s, preload)), elsewhere
+        as_guest = AsGuest(run_method, guests.timeout_s, guests.preload)
+        yield partial(elsewhere.run, as_guest), elsewhere
         return
-    cores = 1 if jobs[0].device == "cuda" else len(os.sched_getaffinity(0))
-    workers = options.workers or cores
-    guests = GuestLauncher(workers, table.cell_timeout_s, preload)
     # A further process loads for as long as it takes to score some cells here.
-    with LocalLauncher(min(workers, 1 + len(jobs) // _CELLS_PER_SCORER)) as local:
+    with LocalLauncher(min(guests.workers, 1 + len(jobs) // _CELLS_PER_SCORER)) as local:
         yield partial(guests.run, run_method), local
 
 

@@ -12,7 +12,6 @@ from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
 
-from benchmarks.methods.base import Method, Unavailable
 from benchmarks.protocol.draws import digest
 from benchmarks.protocol.prepared_scene import Scene
 from extrap_train.config import MethodConfig, RulesConfig, ScoringConfig
@@ -23,8 +22,6 @@ from extrap_train.store.manifest import Manifest
 
 KEY_LENGTH = 20
 """Hexadecimal digits of a cell's key."""
-MISSING_WEIGHTS = "missing: "
-"""What stands in place of the digest of weights that are not there, before the reason."""
 _ROOT = Path(__file__).parents[2]
 _MAKING = (
     "extrap_train",
@@ -53,27 +50,22 @@ def identity_of(manifest: Manifest) -> str:
     return digest([dict(manifest.options), dict(manifest.inputs)])
 
 
+def making_code(module: str = "") -> str:
+    """Digest of the code that makes images, with that of a method's own module."""
+    return sources_digest(_MAKING, module)
+
+
 def images_manifest(
     config: MethodConfig,
-    method: Method,
     scene: Scene,
     weights: str,
+    code: str,
     rules: RulesConfig,
     device: str,
 ) -> Manifest:
     """What a method's images of a scene follow from."""
-    code = sources_digest(_MAKING, type(method).__module__)
     inputs = {"photographs": scene.data_hash, "weights": weights, "code": code}
     return Manifest.of(image_options(config, rules, device), inputs)
-
-
-def weights_digest(method: Method, category: str) -> str:
-    """Of a method's weight files, in their order; where they lie does not matter."""
-    try:
-        files = method.weight_files(category)
-    except Unavailable as error:
-        return f"{MISSING_WEIGHTS}{error}"  # once they are there, the cell is another
-    return hashlib.sha256("".join(map(file_digest, files)).encode()).hexdigest()
 
 
 def image_options(config: MethodConfig, rules: RulesConfig, device: str) -> dict[str, object]:

@@ -1,12 +1,11 @@
 """From a table to its cells: protocol, prepared draws, and what each cell is named by."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
 
-from benchmarks.methods.base import Method
 from benchmarks.protocol.captures import Capture, freeze, open_captures, trained_models
 from benchmarks.protocol.draws import Draw, Protocol
 from benchmarks.protocol.prepared_scene import Scene, truths_of
@@ -18,8 +17,8 @@ from benchmarks.run.identity import (
     images_manifest,
     scene_origin,
     scores_manifest,
-    weights_digest,
 )
+from benchmarks.run.method_content import MethodContent
 from extrap_train.config import MethodConfig, TableConfig
 from extrap_train.data.frame_files import sequence_folder
 from extrap_train.errors import InputError
@@ -140,25 +139,19 @@ def cell_jobs(
     table: TableConfig,
     folder: TableFolder,
     protocol: Protocol,
-    methods: Mapping[str, tuple[MethodConfig, Method]],
+    configs: Sequence[MethodConfig],
+    contents: Mapping[str, MethodContent],
     scenes: list[Scene],
 ) -> list[CellJob]:
     """One job per method and draw, scene by scene, each named by all that decides its result."""
-    device = "cuda" if table.device != "cpu" and torch.cuda.is_available() else "cpu"
-    if table.device == "cuda" and device == "cpu":
-        raise InputError("device=cuda: there is no CUDA device here; give device=cpu")
+    device = device_of(table)
     scored_from = scores_manifest(table.scoring)
-    categories = {scene.draw.category for scene in scenes}
-    weights = {
-        (name, category): weights_digest(method, category)
-        for category in categories
-        for name, (_, method) in methods.items()
-    }
     jobs = []
     for scene in scenes:
-        for name, (config, method) in methods.items():
-            known = weights[name, scene.draw.category]
-            made_from = images_manifest(config, method, scene, known, protocol.rules, device)
+        for config in configs:
+            content = contents[config.name]
+            weights, code = content.weights[scene.draw.category], content.code
+            made_from = images_manifest(config, scene, weights, code, protocol.rules, device)
             jobs.append(
                 CellJob(
                     folder=folder.cells / cell_key(made_from, scored_from),
@@ -173,6 +166,14 @@ def cell_jobs(
                 )
             )
     return jobs
+
+
+def device_of(table: TableConfig) -> str:
+    """Where methods run; InputError where that is not here."""
+    device = "cuda" if table.device != "cpu" and torch.cuda.is_available() else "cpu"
+    if table.device == "cuda" and device == "cpu":
+        raise InputError("device=cuda: there is no CUDA device here; give device=cpu")
+    return device
 
 
 def require_different(methods: Iterable[MethodConfig]) -> None:

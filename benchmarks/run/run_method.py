@@ -55,7 +55,9 @@ def run_method(job: CellJob) -> bytes:
         with PeakMemory() as memory, Stopwatch() as watch:
             for seed in (random.seed, np.random.seed, torch.manual_seed):
                 seed(inputs.seed)
-            synthesis = build_method(job.method).synthesize(inputs)
+            method = build_method(job.method)
+            weight_paths(method, inputs.category)  # what fails there is no sound method's
+            synthesis = method.synthesize(inputs)
         return _packed(synthesis, inputs, job.method, watch.seconds, memory.mib)
     except Unavailable as error:
         return pack_output(MethodOutput(status=UNAVAILABLE, reason=str(error)))
@@ -87,6 +89,14 @@ def build_method(config: MethodConfig) -> Method:
     if is_dataclass(method):
         check_options(method, f"options.{config.name}.")
     return method
+
+
+def weight_paths(method: Method, category: str) -> list[Path]:
+    """The files that a method names; TypeError where it returns anything else."""
+    files: Any = method.weight_files(category)
+    if not isinstance(files, (list, tuple)) or not all(isinstance(f, (str, Path)) for f in files):
+        raise TypeError(f"weight_files() returns paths, not {type(files).__name__}")
+    return [Path(file) for file in files]
 
 
 def _typed_options(config: MethodConfig, factory: Any) -> dict[str, Any]:

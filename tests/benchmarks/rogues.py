@@ -138,6 +138,34 @@ HANGS = {
     "waits_for_child": "subprocess.run(['sleep', '3000'])",
 }
 
+BEFORE = {
+    "import_raise": ("1 / 0", "return ()", "ZeroDivisionError"),
+    "import_exit": ("import sys; sys.exit(0)", "return ()", "SystemExit"),
+    "import_patch": ("import benchmarks.score.scoring as s; s.psnr = None", "return ()", ""),
+    "weights_raise": ("", "1 / 0", "ZeroDivisionError"),
+    "weights_exit": ("", "import sys; sys.exit(0)", "SystemExit"),
+    "weights_none": ("", "return None", "TypeError"),
+    "weights_kill": ("", "import os; os._exit(0)", "exit status 0"),
+    "weights_text": ("", "return [__file__]", ""),
+}
+"""By name: what the module does when it is imported, what `weight_files` does, and what must become
+of the row: a part of the reason, or nothing where it is sound.
+"""
+_MODULE = """
+import torch
+from benchmarks.methods.base import Synthesis
+{imported}
+
+
+class Rogue:
+    def weight_files(self, category):
+        {weights}
+
+    def synthesize(self, inputs):
+        count = len(inputs.targets.world_to_cam)
+        return Synthesis(torch.zeros(count, 3, inputs.targets.height, inputs.targets.width), 0.1)
+"""
+
 _METHOD = """
 import atexit, builtins, ctypes, gc, os, random, resource, signal, stat, subprocess, sys, tempfile
 import threading, time, warnings
@@ -197,5 +225,9 @@ def write_rogues(folder: Path) -> Path:
     for name in acts():
         text = f"factory: rogue_method.Rogue\noptions: {{act: {name}}}\n"
         (folder / "method" / f"{name}.yaml").write_text(text)
+    for name, (imported, weights, _) in BEFORE.items():
+        module = _MODULE.format(imported=imported, weights=weights)
+        (folder / f"{name}_module.py").write_text(module)
+        (folder / "method" / f"{name}.yaml").write_text(f"factory: {name}_module.Rogue\n")
     (folder / "table" / "rogues.yaml").write_text(_TABLE)
     return folder

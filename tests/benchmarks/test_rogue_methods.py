@@ -20,7 +20,7 @@ from benchmarks.report.verify import verify
 from benchmarks.run.cells import Cell
 from benchmarks.run.plan import TableFolder
 from benchmarks.run_table import RunOptions, run_table
-from tests.benchmarks.rogues import ENDS, HANGS, LEFTOVERS, SOUND, STATE, write_rogues
+from tests.benchmarks.rogues import BEFORE, ENDS, HANGS, LEFTOVERS, SOUND, STATE, write_rogues
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="asks /proc for processes")
 
@@ -145,6 +145,14 @@ def test_a_rogue_is_a_row_and_the_others_are_as_without_it(
     ok = ["default_dtype", "chdir", "thread", "orphan", "interrupts_parent"]
     cells = _run(rogues, tmp_path, [*ends, *ok])
     _require_rows(cells, honest, {name: ENDS[name][1] for name in ends}, ok)
+
+
+def test_what_a_module_does_before_it_makes_images_is_its_own_row(
+    rogues: Path, honest: dict[str, Cell], tmp_path: Path
+) -> None:
+    cells = _run(rogues, tmp_path, [*BEFORE])
+    failed = {name: reason for name, (_, _, reason) in BEFORE.items() if reason}
+    _require_rows(cells, honest, failed, [name for name in BEFORE if name not in failed])
 
 
 @pytest.mark.slow

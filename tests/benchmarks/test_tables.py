@@ -16,6 +16,7 @@ from benchmarks.protocol.prepared_scene import Scene
 from benchmarks.report.aggregate import TIDY, Results, read_results
 from benchmarks.report.compare import compare
 from benchmarks.run import run_method
+from benchmarks.run.method_content import MethodContent
 from benchmarks.run.plan import cell_jobs, open_protocol
 from benchmarks.run.run_method import check_output
 from extrap_train.errors import InputError
@@ -177,8 +178,9 @@ def test_a_cell_of_the_cpu_sees_no_gpu_from_its_start(
     protocol, _ = open_protocol(table, folder)
     scenes = [Scene.open(path) for path in folder.scenes.glob("*-*")]
     config = catalogue.method("dark")
-    methods = {"dark": (config, run_method.build_method(config))}
-    job = cell_jobs(table, folder, protocol, methods, scenes)[0]
+    categories = {scene.draw.category for scene in scenes}
+    content = MethodContent(dict.fromkeys(categories, "none"), "this")
+    job = cell_jobs(table, folder, protocol, [config], {"dark": content}, scenes)[0]
     made = check_output(run_method.run_method(job), 6, 24, "dark")
     assert made.output.status == "made"
     assert seen == [""]
