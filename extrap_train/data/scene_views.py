@@ -1,5 +1,6 @@
 """A scene's posed views as a model takes them: framed, sized and with depth."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -14,6 +15,8 @@ from extrap_train.depth import DepthSource
 from extrap_train.errors import InputError, did_you_mean
 from extrap_train.geometry.viewpoints import camera_centers, farthest_point_sample
 from extrap_train.views import View, stack_poses
+
+LOG = logging.getLogger(__name__)
 
 
 def select_input_frames(
@@ -63,8 +66,20 @@ def input_views(
 
 def target_views(frames: Sequence[Frame], size: int) -> list[View]:
     """Frames framed in the same way, without depth: what a generated view is compared with."""
-    loaded = [replace(frame.load(depth=False), name=frame.name) for frame in frames]
-    return [object_square(view, size) for view in loaded]
+    return [object_square(view, size) for view in load_readable(frames)]
+
+
+def load_readable(frames: Sequence[Frame]) -> list[View]:
+    """The photographs without depth; those that cannot be read are left out with a warning."""
+    views, reasons = [], []
+    for frame in frames:
+        try:
+            views.append(replace(frame.load(depth=False), name=frame.name))
+        except InputError as error:
+            reasons.append(str(error))
+    if reasons:
+        LOG.warning("%d held-out photographs are left out: %s", len(reasons), reasons[0])
+    return views
 
 
 def _unit(pixels: UInt8[np.ndarray, "..."]) -> Float[Tensor, "..."]:

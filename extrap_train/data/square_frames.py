@@ -24,7 +24,9 @@ HELD_OUT_EVERY = 5
 LEAST_KNOWN_SHARE = 0.25
 """Of the finer depths under a pixel, for it to have one."""
 MOST_UNUSABLE_SHARE = 0.1
-"""Of a sequence's frames, beyond which the whole sequence is not trusted."""
+"""Of a sequence's frames, beyond which the whole sequence is not trusted; a single frame never is
+a reason while `LEAST_FRAMES` are left."""
+LEAST_FRAMES = 2
 METHOD = 2
 """Raised whenever the same photographs give other frames."""
 LOG = logging.getLogger(__name__)
@@ -129,7 +131,8 @@ def _usable_views(sequence: FrameSequence, where: str, size: int, *, depth: bool
 def too_many_unusable(reasons: Sequence[str], sequence: FrameSequence) -> str:
     """Why a sequence is not trusted with these unusable frames, one reason each; empty if it is."""
     count = len(sequence.frames) + len(sequence.left_out)
-    if len(reasons) <= MOST_UNUSABLE_SHARE * count:
+    allowed = max(MOST_UNUSABLE_SHARE * count, 1 if count > LEAST_FRAMES else 0)
+    if len(reasons) <= allowed:
         return ""
     return f"{len(reasons)} of {count} frames cannot be used, the first because of {reasons[0]}"
 

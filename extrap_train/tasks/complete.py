@@ -1,5 +1,6 @@
 """`task=complete`: from a few posed photographs of a scene to a full turn around it."""
 
+import logging
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -21,6 +22,7 @@ from extrap_train.config import (
 from extrap_train.data.photographs import CATEGORY
 from extrap_train.data.scene import SYNTHETIC_SCHEME, open_scene
 from extrap_train.data.sequences import Frame, FrameSequence
+from extrap_train.data.square_frames import too_many_unusable
 from extrap_train.data.synthetic import SyntheticScene, build_scene
 from extrap_train.depth.sources import depth_source
 from extrap_train.device import advise_on_sampling_memory
@@ -69,6 +71,8 @@ from extrap_train.tasks.scene_model import (
 )
 from extrap_train.terminal import progress, terminal
 from extrap_train.views import stack_cameras, stack_poses
+
+LOG = logging.getLogger(__name__)
 
 _NOT_PART_OF_THE_MAP = (
     "dry_run",
@@ -142,6 +146,7 @@ def _job(config: TrainConfig) -> _Job:
     inputs = choose_frames(
         sequence.frames, config.inputs, config.input_frames, config.complete.draw, config.seed
     )
+    inputs = _readable(config, sequence, inputs)
     cameras = [sequence.frames[i].camera for i in inputs]
     check_cameras(cameras, [sequence.frames[i].name for i in inputs])
     _check_category(config, sequence)
@@ -150,6 +155,28 @@ def _job(config: TrainConfig) -> _Job:
     return _Job(
         config, sequence, truth, folder, inputs, fit_world_frame(stack_poses(cameras)), used
     )
+
+
+def _readable(config: TrainConfig, sequence: FrameSequence, inputs: list[int]) -> list[int]:
+    """The inputs without those whose files cannot be read; InputError if named, or too many."""
+    depth = isinstance(config.depth, DatasetDepthConfig)
+    readable, reasons = [], []
+    for index in inputs:
+        frame = sequence.frames[index]
+        try:
+            if frame.files:
+                frame.load(depth=depth)
+            readable.append(index)
+        except InputError as error:
+            if config.input_frames:
+                raise
+            reasons.append(str(error))
+    part = replace(sequence, frames=[sequence.frames[i] for i in inputs], left_out=())
+    if too_many := too_many_unusable(reasons, part):
+        raise InputError(f"scene {config.scene}: {too_many}")
+    if reasons:
+        LOG.warning("%d input photographs are left out: %s", len(reasons), reasons[0])
+    return readable
 
 
 def _check_category(config: TrainConfig, sequence: FrameSequence) -> None:

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from extrap_train.config import TrainConfig
+from extrap_train.data.scene_views import load_readable
 from extrap_train.data.sequences import Frame, FrameSequence
 from extrap_train.data.synthetic import SyntheticScene
 from extrap_train.gaussians.fit import Diverged
@@ -192,7 +193,9 @@ def _compare_held_out(
     if not frames or config.complete.generator == "exact":
         return None, {}
     size = workshop.generator.image_size
-    truth = [frame.load(depth=False).squared(size) for frame in frames]
+    truth = [view.squared(size) for view in load_readable(frames)]
+    if not truth:
+        return None, {}
     cameras = [done.world.inside(view.camera) for view in truth]
     made, warps, masks = [], [], []
     only = GlobalMap(done.known.tolerance, given)
@@ -216,7 +219,7 @@ def _compare_held_out(
     )
     mask = torch.stack(masks)
     scores: dict[str, float | None] = {
-        "views": float(len(frames)),
+        "views": float(len(truth)),
         "psnr": float(psnr(images, photos).mean()),
         "psnr_masked": float(psnr(images, photos, mask).nanmean()),
         "ssim": float(ssim(images, photos).mean()),

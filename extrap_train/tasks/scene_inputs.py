@@ -83,6 +83,10 @@ def open_inputs(
     part, chosen = input_frames(config, sequence, query)
     views = input_views(part, chosen, depth_source(config.depth), image_size)
     names = {view.name for view in views}
+    if lost := [name for name in config.input_frames if name not in names]:
+        raise InputError(
+            f"input_frames: {lost[0]} cannot be used, as the warning says; mend it or name another"
+        )
     others = [frame for frame in sequence.frames if frame.name not in names]
     return SceneInputs(views, others)
 

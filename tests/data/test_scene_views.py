@@ -5,7 +5,12 @@ import pytest
 import torch
 from orbits import capture, even, ring
 
-from extrap_train.data.scene_views import input_views, select_input_frames, target_views
+from extrap_train.data.scene_views import (
+    input_views,
+    load_readable,
+    select_input_frames,
+    target_views,
+)
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError
 
@@ -36,3 +41,24 @@ def test_views_have_the_models_size_and_their_own_depth():
     truth = target_views([SCENE.frames[3]], 16)[0]
     np.testing.assert_allclose(truth.camera.intrinsics, views[0].camera.intrinsics, atol=1e-4)
     assert truth.depth is None
+
+
+@pytest.mark.parametrize("count", [3, 5, 9])
+def test_one_bad_frame_costs_its_frame_while_two_are_left(count, caplog):
+    scene = capture(ring(even(12)), broken=(1,))
+    views = input_views(scene, list(range(count)), DatasetDepth(), 16)
+    assert [view.name for view in views] == [f"frame{i}" for i in range(count) if i != 1]
+    assert "frame1.jpg: truncated" in caplog.text
+
+
+@pytest.mark.parametrize(("count", "broken"), [(2, (1,)), (3, (0, 1)), (9, (1, 2))])
+def test_more_bad_frames_are_too_many(count, broken):
+    with pytest.raises(InputError, match="frames cannot be used"):
+        input_views(capture(ring(even(12)), broken=broken), list(range(count)), DatasetDepth(), 16)
+
+
+def test_a_bad_held_out_photograph_is_left_out(caplog):
+    frames = capture(ring(even(4)), broken=(2,)).frames
+    assert [view.name for view in target_views(frames, 16)] == ["frame0", "frame1", "frame3"]
+    assert load_readable(frames[2:3]) == []
+    assert "frame2.jpg: truncated" in caplog.text
