@@ -19,6 +19,7 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from extrap_train.command_line import CommandLine, explain
 from extrap_train.command_options import GROUPS, CommandOptions, choices_of, help_text
@@ -106,7 +107,7 @@ def _compose(options: CommandOptions, run: Callable[[Any], Outcome | Path | None
     try:
         os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # what is left to go wrong is a bug
         composed()
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, YAMLError) as error:
         raise InputError(explain(error, options, sys.argv[1:])) from None
 
 
@@ -117,7 +118,7 @@ def compose_config(options: CommandOptions, words: Sequence[str]) -> Any:
         with hydra.initialize_config_module("conf", version_base="1.3"):
             prepared = CommandLine.split(words).prepared(options)
             return typed_config(hydra.compose(options.config_name, prepared))
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, YAMLError) as error:
         raise InputError(explain(error, options, words)) from None
 
 

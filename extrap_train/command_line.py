@@ -13,6 +13,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf.errors import ConfigKeyError, OmegaConfBaseException, ValidationError
+from yaml import MarkedYAMLError, YAMLError
 
 from extrap_train.command_options import CommandOptions, choices_of, suggest
 from extrap_train.config import Option
@@ -25,6 +26,15 @@ def explain(error: Exception, options: CommandOptions, overrides: Sequence[str])
         group, _, name = str(error.missing_cfg_file).rpartition("/")
         known = [known for known in error.options or () if not known.endswith("_schema")]
         return f"{group}={name} is unknown{suggest(name, known)}; known: {', '.join(known)}"
+    if isinstance(error, YAMLError):
+        where = error.problem_mark if isinstance(error, MarkedYAMLError) else None
+        place = f"{where.name}, line {where.line + 1}" if where else "a file of options"
+        problem = error.problem if isinstance(error, MarkedYAMLError) else error
+        return f"{place}: is no valid YAML ({problem}); correct it"
+    if "ConfigKeyError" in str(error) and (
+        found := re.match(r"In '(.+)': .*\n(?:.*\n)*? *full_key: (\S+)", str(error))
+    ):
+        return f"{found[1]}.yaml: {unknown_option(found[2], options)}"
     cause = error if isinstance(error, OmegaConfBaseException) else error.__cause__
     if isinstance(cause, OmegaConfBaseException) and cause.full_key:
         key = re.sub(r"\[\d+\]$", "", cause.full_key)

@@ -362,3 +362,24 @@ def test_data_prep_takes_threads_for_its_processes(
     monkeypatch.setattr(sys, "argv", ["it", "category=hydrant", *words])
     prepare()
     assert asked == [workers]
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        ("name: [vase\n", ("mine.yaml, line 2", "no valid YAML")),
+        ("name: vase\n\tmembers: []\n", ("mine.yaml, line 2", "no valid YAML")),
+        ("defaults: [category_schema]\ncolour: 3\n", ("category/mine.yaml", "category.colour")),
+    ],
+)
+def test_a_choice_of_ones_own_that_is_malformed_is_one_line(
+    content: str,
+    expected: tuple[str, ...],
+    own_choices: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    (own_choices / "category/mine.yaml").write_text(content)
+    message = _error([f"--config-dir={own_choices}", "category=mine"], monkeypatch, tmp_path)
+    assert "\n" not in message
+    assert all(text in message for text in expected), message
