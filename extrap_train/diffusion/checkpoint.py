@@ -63,21 +63,11 @@ def save_model(model: ExtrapolationModel, folder: Path, dtype: torch.dtype = tor
 
 
 def save_compact(model: ExtrapolationModel, folder: Path, base: str = "base") -> None:
-    """Write the model as its difference to a packaged one (`compact`); lossy, for packages.
-
-    The folder appears complete or not at all; an older one of that name is replaced.
-    """
+    """Write the model into a folder as its difference to a packaged one; lossy, for packages."""
     start = packaged_weights(base)
     tensors = compress(_state(model), _state(load_model(start)))
-    temporary = partial_path(folder)
-    shutil.rmtree(temporary, ignore_errors=True)
-    try:
-        write_record(temporary / MODEL_CONFIG, model.config)
-        write_tensors(tensors, temporary / _COMPACT, {"base": base, "base_sha256": _digest(start)})
-        shutil.rmtree(folder, ignore_errors=True)
-        temporary.replace(folder)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    write_record(folder / MODEL_CONFIG, model.config)
+    write_tensors(tensors, folder / _COMPACT, {"base": base, "base_sha256": _digest(start)})
 
 
 def is_compact(folder: Path) -> bool:

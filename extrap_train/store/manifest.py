@@ -170,7 +170,9 @@ class Claim:
 
 
 @contextmanager
-def claim(folder: Path, manifest: Manifest, *, resume: bool) -> Iterator[Claim]:
+def claim(
+    folder: Path, manifest: Manifest, *, resume: bool, remedy: str = REMEDY
+) -> Iterator[Claim]:
     """Hold a result's folder for this process alone as long as the block lasts.
 
     Leftovers of killed writers are removed. With `resume`, what lies there must be of the same
@@ -182,7 +184,7 @@ def claim(folder: Path, manifest: Manifest, *, resume: bool) -> Iterator[Claim]:
     with file_lock(folder.with_name(f".{folder.name}.lock"), taken):
         is_reused = resume and folder.exists()
         if is_reused:
-            require_same(folder, manifest)
+            require_same(folder, manifest, remedy)
         remove_leftovers(folder.parent)
         for part in (folder, *(path for path in folder.rglob("*") if path.is_dir())):
             remove_leftovers(part)
