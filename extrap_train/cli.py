@@ -134,6 +134,8 @@ def _complete(options: CommandOptions, run: Callable[[Any], Outcome | Path | Non
 
 def _remedy(error: OSError, output: str) -> str | None:
     """What a user can do about it; None where it says nothing of a disk or folder of theirs."""
+    if error.errno == errno.ENAMETOOLONG:
+        return "give a shorter run=NAME or output="
     place = Path(str(error.filename or output))
     is_of_output = _is_of_output(place.absolute(), Path(output).absolute())
     if error.errno in _NO_ROOM or (is_of_output and error.errno in _CLOSED):

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import platform
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
@@ -52,6 +53,8 @@ that is saved, how the machine goes about the same mathematics, and what other t
 model recommends to sample with is part of the run as far as it is used, under `sampler`.
 """
 
+_MAX_NAME_BYTES = 150
+"""Of a result's folder: files beside it add the writer to its name, in 255 bytes at most."""
 _LATEST = "latest"
 """Link to the newest run of a model and category."""
 
@@ -244,6 +247,16 @@ def given_name(config: TrainConfig) -> str | None:
     name = config.run
     if name and (name in (".", "..", _LATEST) or {"/", "\\", "\0"} & set(name)):
         raise InputError(f"run={name!r}: must be the name of a folder, other than {_LATEST}")
+    return short_name(name) if name else None
+
+
+def short_name(name: str) -> str:
+    """`name`, if a result's folder may be called so; InputError if it is too long."""
+    if (length := len(os.fsencode(name))) > _MAX_NAME_BYTES:
+        raise InputError(
+            f"{name[:20]!r}… is too long a name for a result ({length} bytes of at most "
+            f"{_MAX_NAME_BYTES}): give a shorter run=NAME"
+        )
     return name
 
 

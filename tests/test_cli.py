@@ -202,6 +202,16 @@ def test_a_full_disk_anywhere_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_p
     assert "out: No space left on device" in _error(["category=hydrant"], monkeypatch, tmp_path)
 
 
+def test_a_name_that_is_too_long_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def run(*_: object) -> None:
+        (tmp_path / "out" / ("x" * 300)).mkdir(parents=True)
+
+    monkeypatch.setattr("extrap_train.__main__.task", lambda name: run)
+    assert "shorter run=NAME" in _error(["category=hydrant"], monkeypatch, tmp_path)
+
+
 @pytest.mark.parametrize(
     ("place", "remedy"),
     [

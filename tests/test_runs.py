@@ -31,9 +31,11 @@ from extrap_train.runs import (
     require_same_options,
     run_folder,
     run_identity,
+    short_name,
 )
-from extrap_train.store.manifest import Conflict, Manifest, Split, read_manifest
+from extrap_train.store.manifest import Conflict, Manifest, Split, claim, read_manifest
 from extrap_train.tasks.category import _opened
+from extrap_train.tasks.scene_inputs import result_folder
 from extrap_train.terminal import terminal
 
 _SPLIT = Split("synthetic", ("0001",), ("0000",))
@@ -67,6 +69,23 @@ def config(tmp_path: Path) -> TrainConfig:
         model=ModelConfig(name="small"),
         output=str(tmp_path),
     )
+
+
+@pytest.mark.parametrize("name", ["x" * 240, "x" * 151, "ü" * 76])
+def test_a_name_too_long_for_the_files_beside_it_is_refused(config: TrainConfig, name: str) -> None:
+    with pytest.raises(InputError, match=r"of at most 150.*run=NAME"):
+        run_folder(replace(config, run=name))
+    with pytest.raises(InputError, match=r"of at most 150.*run=NAME"):
+        result_folder(replace(config, task="view"), name)
+
+
+@pytest.mark.parametrize("name", ["x" * 150, "ü" * 75])
+def test_the_longest_name_leaves_room_for_the_files_beside_it(tmp_path: Path, name: str) -> None:
+    folder = tmp_path / short_name(name)
+    for _ in range(2):
+        with claim(folder, Manifest.of({}), resume=False) as claimed:
+            claimed.begin()
+    assert folder.is_dir()
 
 
 def test_the_same_options_find_the_same_folder(config: TrainConfig, tmp_path: Path) -> None:

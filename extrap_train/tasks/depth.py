@@ -21,6 +21,7 @@ from extrap_train.reconstruction.depth_completion.training import (
     StoredExamples,
     save_examples,
 )
+from extrap_train.runs import given_name
 from extrap_train.store import Outcome
 from extrap_train.store.manifest import Manifest, claim
 from extrap_train.store.records import write_summary
@@ -44,7 +45,7 @@ def run(config: TrainConfig) -> Outcome:
             f"data={data.name}: task=depth needs captures whose depth is known everywhere; use "
             "data=synthetic"
         )
-    folder = Path(config.output) / "depth" / (config.run or config.category.name)
+    folder = Path(config.output) / "depth" / (given_name(config) or config.category.name)
     with claim(folder, _manifest(config), resume=config.resume) as claimed:
         if not claimed.is_reused:
             claimed.begin()

@@ -16,7 +16,7 @@ from extrap_train.data.scene_views import input_views, select_input_frames
 from extrap_train.data.sequences import Frame, FrameSequence
 from extrap_train.depth.sources import depth_source, weight_files
 from extrap_train.errors import InputError
-from extrap_train.runs import given_name
+from extrap_train.runs import given_name, short_name
 from extrap_train.store.digests import file_digest
 from extrap_train.store.manifest import Manifest
 from extrap_train.views import View
@@ -147,7 +147,7 @@ def scene_manifest(
 
 def result_folder(config: TrainConfig, label: str) -> Path:
     """Where a task's result about a scene lies: called like the scene, or as `run` says."""
-    return Path(config.output) / config.task / (given_name(config) or label)
+    return Path(config.output) / config.task / (given_name(config) or short_name(label))
 
 
 @contextmanager
