@@ -70,6 +70,7 @@ class SweepTable(Callback):
                 require_same(folder, manifest, "give another hydra.sweep.dir")
             else:
                 write_record(folder / MANIFEST, manifest)
+            read_rows(folder / _TABLE)  # before any job runs, which could not add its row
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
         """Hydra's hook."""
@@ -189,10 +190,25 @@ def add_row(file: Path, row: Row) -> pd.DataFrame:
 
 
 def read_rows(file: Path) -> pd.DataFrame:
-    """The rows that are there, as texts."""
+    """The rows that are there, as texts; InputError where the file is no such table any more."""
     if not file.is_file():
         return pd.DataFrame(columns=[*_HEAD, *_TAIL], dtype=str)
-    return pd.read_csv(file, dtype=str, keep_default_na=False)
+    try:
+        rows = pd.read_csv(file, dtype=str, keep_default_na=False, encoding="utf-8-sig")
+        if not isinstance(rows.index, pd.RangeIndex):
+            raise ValueError("its rows are longer than its head")
+        if missing := {*_NO_OPTIONS} - {*rows}:
+            raise ValueError(f"it has no column {min(missing)}")
+        if not rows["job"].str.fullmatch("[0-9]{1,9}").all():
+            raise ValueError("a job is no number")
+        rows.filter(like=METRIC).replace("", None).apply(pd.to_numeric)
+    except ValueError as error:
+        reason = " ".join(str(error).split())
+        raise InputError(
+            f"{file}: is not the table that a sweep wrote ({reason}); move it away or give another "
+            "hydra.sweep.dir"
+        ) from None
+    return rows
 
 
 def draw(rows: pd.DataFrame, file: Path) -> None:

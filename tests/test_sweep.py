@@ -1,5 +1,6 @@
 """A sweep ends with a row for every job, whatever became of it."""
 
+import codecs
 import json
 import sys
 from collections.abc import Callable
@@ -198,6 +199,44 @@ def test_another_sweep_does_not_mix_its_rows_with_those_that_lie_there(
         assert _lines(said) == 1
         assert (folder / "sweep.csv").read_bytes() == before
     assert _sweep(monkeypatch, train, folder, "category=apple", "seed=0,1") is None
+
+
+def test_a_table_that_a_spreadsheet_marked_as_unicode_is_read(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    train, folder = _trained(tmp_path), tmp_path / "sweep"
+    assert _sweep(monkeypatch, train, folder, "category=apple", "seed=0,1") is None
+    before = (folder / "sweep.csv").read_bytes()
+    (folder / "sweep.csv").write_bytes(codecs.BOM_UTF8 + before)
+    assert _sweep(monkeypatch, train, folder, "category=apple", "seed=0,1") is None
+    assert (folder / "sweep.csv").read_bytes().startswith(b"job,status,")
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        lambda table: table.replace(b",", b";"),
+        lambda table: table.replace(b"apple", "\xe4pfel".encode("latin-1")),
+        lambda table: table.replace(b"\n0,", b"\nthe first,"),
+        lambda table: table.replace(b"\n0,", b"\n0,more,and,more,"),
+        lambda table: table.replace(b"\n", b",\n").replace(b"reason,\n", b"reason\n"),
+        lambda table: table.replace(b",20.0,", b',"20,0 dB",').replace(b",23.0,", b',"23,0",'),
+        lambda table: b"",
+        lambda table: b"\0" * 99,
+    ],
+)
+def test_a_table_that_a_spreadsheet_changed_ends_the_sweep_before_its_jobs(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, edit: Callable[[bytes], bytes]
+) -> None:
+    words, folder = ("category=apple", "seed=0,1", "trainer.steps=3"), tmp_path / "sweep"
+    assert _sweep(monkeypatch, _trained(tmp_path), folder, *words) is None
+    changed = edit((folder / "sweep.csv").read_bytes())
+    (folder / "sweep.csv").write_bytes(changed)
+    said = _sweep(monkeypatch, lambda _: pytest.fail("a job ran"), folder, *words)
+    assert "sweep.csv" in (said or "")
+    assert "hydra.sweep.dir" in (said or "")
+    assert _lines(said) == 1
+    assert (folder / "sweep.csv").read_bytes() == changed
 
 
 @pytest.mark.parametrize("content", ["", "[" * 20_000, "{}"])
