@@ -2,25 +2,19 @@
 its result.
 """
 
-import importlib
 import io
 import json
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import time
 from contextlib import redirect_stdout
-from dataclasses import dataclass
-from multiprocessing.context import ForkServerContext
-from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any
 
-import numba
 import pandas as pd
 import pytest
-import torch
 from tiny_job import TINY
 
 from extrap_train.__main__ import main
@@ -40,45 +34,13 @@ def _arguments(output: Path, *more: str) -> list[str]:
     return [*_OPTIONS, f"output={output}", *more]
 
 
-@dataclass(frozen=True)
-class _Kill:
-    """A job kills itself when it calls `module.owner.name` with `where` in an argument."""
-
-    module: str
-    owner: str
-    name: str
-    where: str = ""
-
-    def arm(self) -> None:
-        owner = getattr(importlib.import_module(self.module), self.owner)
-        really = getattr(owner, self.name)
-
-        def killed(*arguments: Any, **options: Any) -> Any:
-            if self.where in str(arguments):
-                if self.name == "save":
-                    Path(arguments[1]).write_bytes(b"half")
-                os.kill(os.getpid(), signal.SIGKILL)
-            return really(*arguments, **options)
-
-        setattr(owner, self.name, killed)
-
-
-def _run_job(output: Path, kill: _Kill | None) -> None:
+def _start(
+    output: Path, program: tuple[str, str] = ("-m", "extrap_train")
+) -> "subprocess.Popen[bytes]":
+    command = [sys.executable, *program, *_arguments(output)]
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     with (output / "log.txt").open("wb") as log:
-        os.dup2(log.fileno(), 1)
-        os.dup2(log.fileno(), 2)
-    sys.argv = ["extrap_train", *_arguments(output)]
-    torch.set_num_threads(1)
-    numba.set_num_threads(1)
-    if kill is not None:
-        kill.arm()
-    main()
-
-
-def _start(fork_server: ForkServerContext, output: Path, kill: _Kill | None = None) -> BaseProcess:
-    job = fork_server.Process(target=_run_job, args=(output, kill))
-    job.start()
-    return job
+        return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
 
 
 def _said(output: Path) -> str:
@@ -155,24 +117,46 @@ def test_a_finished_run_is_measured_again_sampled_otherwise(
     assert (run / "summary.json").read_bytes() == before
 
 
-def _kill_at_file(fork_server: ForkServerContext, output: Path, pattern: str) -> None:
+_KILLED_WITHIN = """
+import os, signal, sys
+from extrap_train.__main__ import main
+from {module} import {owner} as owner
+
+def killed(*arguments, **options):
+    if "{where}" in str(arguments):
+        if "{name}" == "save":
+            open(arguments[1], "wb").write(b"half")
+        os.kill(os.getpid(), signal.SIGKILL)
+    return really(*arguments, **options)
+
+really, owner.{name} = owner.{name}, killed
+main()
+"""
+"""A job that kills itself where a function is called, of a file half-written if it saves one."""
+
+
+def _kill_at_file(output: Path, pattern: str) -> None:
     """Start the job and kill it once such a file is there."""
-    job = _start(fork_server, output)
-    while job.is_alive() and not any(output.glob(pattern)):
+    process = _start(output)
+    while process.poll() is None and not any(output.glob(pattern)):
         time.sleep(0.02)
-    assert job.is_alive(), _said(output)
-    job.kill()
-    job.join()
+    assert process.poll() is None, _said(output)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
 
 
-def _kill_within(fork_server: ForkServerContext, output: Path, kill: _Kill) -> None:
-    job = _start(fork_server, output, kill)
-    job.join(timeout=300)
-    assert job.exitcode == -signal.SIGKILL, _said(output)
+def _kill_within(output: Path, module: str, owner: str, name: str, where: str) -> None:
+    """Start a job that kills itself within `module.owner.name(…)`, of whose arguments one says
+    `where`.
+    """
+    script = _KILLED_WITHIN.format(module=module, owner=owner, name=name, where=where)
+    process = _start(output, program=("-c", script))
+    process.wait(timeout=300)
+    assert process.returncode == -signal.SIGKILL, _said(output)
 
 
-_WITHIN_CHECKPOINT = _Kill("extrap_train.diffusion.resume", "torch", "save", "step-00000006")
-_WITHIN_VALIDATION = _Kill("extrap_train.diffusion", "evaluation", "sample_views")
+_WITHIN_CHECKPOINT = ("extrap_train.diffusion.resume", "torch", "save", "step-00000006")
+_WITHIN_VALIDATION = ("extrap_train.diffusion", "evaluation", "sample_views", "")
 
 
 def _checkpoints(output: Path) -> list[str]:
@@ -180,28 +164,26 @@ def _checkpoints(output: Path) -> list[str]:
 
 
 def test_killed_within_a_checkpoint_the_weights_are_the_same(
-    fork_server: ForkServerContext, undisturbed: Path, tmp_path: Path
+    undisturbed: Path, tmp_path: Path
 ) -> None:
     """SIGKILL with half of the checkpoint written; then run to the end."""
     _link_data(undisturbed, tmp_path)
-    _kill_within(fork_server, tmp_path, _WITHIN_CHECKPOINT)
+    _kill_within(tmp_path, *_WITHIN_CHECKPOINT)
     assert _checkpoints(tmp_path) == ["step-00000003.ckpt"], "killed within writing the second"
     _finish(tmp_path)
     _require_same(tmp_path, undisturbed)
 
 
 @pytest.mark.slow
-def test_killed_again_and_again_the_weights_are_the_same(
-    fork_server: ForkServerContext, undisturbed: Path, tmp_path: Path
-) -> None:
+def test_killed_again_and_again_the_weights_are_the_same(undisturbed: Path, tmp_path: Path) -> None:
     """SIGKILL while sequences are rendered, within the writing of a checkpoint, within the
     validation behind it, and right after the last one; then run to the end.
     """
-    _kill_at_file(fork_server, tmp_path, "synthetic/hydrant/0000/**/*.jpg")
-    _kill_within(fork_server, tmp_path, _WITHIN_CHECKPOINT)
-    _kill_within(fork_server, tmp_path, _WITHIN_VALIDATION)
+    _kill_at_file(tmp_path, "synthetic/hydrant/0000/**/*.jpg")
+    _kill_within(tmp_path, *_WITHIN_CHECKPOINT)
+    _kill_within(tmp_path, *_WITHIN_VALIDATION)
     assert not (_run_folder(tmp_path) / "metrics.csv").read_text().count("validation/")
-    _kill_at_file(fork_server, tmp_path, "train/hydrant/small/*/checkpoints/step-00000012.ckpt")
+    _kill_at_file(tmp_path, "train/hydrant/small/*/checkpoints/step-00000012.ckpt")
     _finish(tmp_path)
     _require_same(tmp_path, undisturbed)
 
