@@ -86,14 +86,24 @@ def _verdict(difference: Float[np.ndarray, " n"], p: float, sign: int) -> str:
 
 def _require_same_data(one: Results, two: Results) -> None:
     """A protocol names frames: what they show is another hash."""
-    known = {_draw(cell): cell.made_from.inputs["photographs"] for cell in one.cells}
+    known = {_draw(cell): _photographs(cell, one) for cell in one.cells}
     for cell in two.cells:
-        photographs = cell.made_from.inputs["photographs"]
+        photographs = _photographs(cell, two)
         if known.get(_draw(cell), photographs) != photographs:
             raise InputError(
                 f"{one.folder.path} and {two.folder.path} hold different photographs or "
                 f"cameras of {cell.scene}: no number of one can be set against the other's"
             )
+
+
+def _photographs(cell: Cell, results: Results) -> str:
+    try:
+        return cell.made_from.inputs["photographs"]
+    except KeyError:
+        raise InputError(
+            f"{results.folder.path}: a cell of {cell.method} does not say which photographs it was "
+            "made from; run the table again"
+        ) from None
 
 
 def _scorings(results: Results) -> dict[tuple[Any, ...], str]:

@@ -303,6 +303,15 @@ def test_compare_keeps_draws_apart_and_refuses_other_photographs(
         compare(_results(finished), _results(tmp_path / "other"))
 
 
+def test_compare_refuses_a_cell_that_does_not_say_what_it_was_made_from(copy: Path) -> None:
+    record = next(copy.glob("greys/cells/*/cell.json"))
+    content = json.loads(record.read_text())
+    del content["made_from"]["inputs"]["photographs"]
+    record.write_text(json.dumps(content))
+    with pytest.raises(InputError, match="photographs"):
+        compare(_results(copy), _results(copy))
+
+
 def test_two_runs_on_one_folder_do_not_mix(own: Path, copy: Path) -> None:
     from filelock import FileLock
 
