@@ -205,7 +205,13 @@ def test_an_interrupted_run_ends_at_once_and_goes_on_later(
     words = ["run", "rogues", f"output={tmp_path}", "--config-dir", str(rogues), "--workers", "1"]
     command = [sys.executable, "-m", "benchmarks", *words, "methods=[honest,deaf]"]
     before = _children_of_init()
-    run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    run = subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell's job ignores it
+    )
     ends = time.monotonic() + 300
     while not list(tmp_path.glob("rogues/cells/*/cell.json")):
         assert run.poll() is None
