@@ -261,6 +261,7 @@ def test_an_option_that_cannot_be_meant_is_refused(options: dict[str, Any]) -> N
         build_method(Catalogue().method("ours_lora", options))
 
 
+@pytest.mark.slow
 def test_the_ablations_rows_run_as_their_files_say(
     fork_server: ForkServerContext, weights: str, tmp_path: Path
 ) -> None:
