@@ -55,7 +55,8 @@ def method_contents(
     """
     wanted = tuple(sorted(categories))
     asked = [(config, wanted) for config in configs if not is_ours(config)]
-    answers = {config.name: _describe(config, wanted) for config in configs if is_ours(config)}
+    ours = [config for config in configs if is_ours(config)]
+    answers = {config.name: _describe(build_method(config), wanted) for config in ours}
     for index, result in guests.run(_describe_apart, asked):
         answers[asked[index][0].name] = _read_answer(result)
     refusals = [answer.refused for answer in answers.values() if answer.refused]
@@ -75,28 +76,21 @@ def _content(answer: _Answer, categories: Sequence[str]) -> MethodContent:
     return MethodContent(dict.fromkeys(categories, MISSING_WEIGHTS + answer.failed), making_code())
 
 
-def _describe(config: MethodConfig, categories: Sequence[str]) -> _Answer:
-    method = build_method(config)
+def _describe(method: Method, categories: Sequence[str]) -> _Answer:
     weights = {category: _weights_digest(method, category) for category in categories}
     return _Answer(weights, making_code(type(method).__module__))
 
 
 def _describe_apart(asked: tuple[MethodConfig, tuple[str, ...]]) -> bytes:
     """The same by a guest: whatever the method's code raises is a part of the answer."""
+    config, categories = asked
     try:
-        build_method(asked[0])
+        answer = _describe(build_method(config), categories)
     except InputError as error:
-        return _ANSWERS.dump_json(_Answer(refused=str(error)))
+        answer = _Answer(refused=str(error))
     except BaseException as error:  # SystemExit and KeyboardInterrupt are its own, too
-        return _ANSWERS.dump_json(_failure(error))
-    try:
-        return _ANSWERS.dump_json(_describe(*asked))
-    except BaseException as error:
-        return _ANSWERS.dump_json(_failure(error))
-
-
-def _failure(error: BaseException) -> _Answer:
-    return _Answer(failed=one_line(f"{type(error).__name__}: {error}"))
+        answer = _Answer(failed=one_line(f"{type(error).__name__}: {error}"))
+    return _ANSWERS.dump_json(answer)
 
 
 def _read_answer(result: bytes | Died) -> _Answer:

@@ -69,7 +69,7 @@ def is_degenerate(camera: Camera) -> Bool[Tensor, "*b"]:
     return ~(finite & (deviation < ROTATION_TOLERANCE) & right_handed & plausible & centred)
 
 
-def is_photographs(camera: Camera) -> Bool[Tensor, "*b"]:
+def fits_photograph(camera: Camera) -> Bool[Tensor, "*b"]:
     """Whether a camera is sound, with a lens that fits a whole photograph of its size."""
     size = camera.intrinsics.new_tensor([camera.width, camera.height])
     focal = camera.intrinsics.diagonal(dim1=-2, dim2=-1)[..., :2]
@@ -106,7 +106,7 @@ def require_sound(camera: Camera, name: str, file: Path) -> None:
     """Raise InputError where the camera of a photograph, read from `file`, cannot be used."""
     if is_degenerate(camera):
         raise InputError(degenerate_camera(name, file))
-    if not is_photographs(camera):
+    if not fits_photograph(camera):
         raise InputError(f"{file}: {name}: {_lens_fault(camera)}")
 
 

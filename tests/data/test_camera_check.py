@@ -13,7 +13,7 @@ from extrap_train.data.camera_check import (
     COLMAP_POSES,
     OPENGL_POSES,
     find_pose_fault,
-    is_photographs,
+    fits_photograph,
     require_sound,
 )
 from extrap_train.errors import InputError
@@ -138,7 +138,7 @@ PHOTOGRAPHS = {
 
 @pytest.mark.parametrize("name", PHOTOGRAPHS)
 def test_lenses_of_photographs_pass(name):
-    assert is_photographs(PHOTOGRAPHS[name])
+    assert fits_photograph(PHOTOGRAPHS[name])
     require_sound(PHOTOGRAPHS[name], name, Path("cameras.json"))
 
 
@@ -155,7 +155,7 @@ def test_lenses_of_photographs_pass(name):
     ],
 )
 def test_lenses_that_fit_no_photograph_are_refused_with_the_likely_cause(camera, cause):
-    assert not is_photographs(camera)
+    assert not fits_photograph(camera)
     with pytest.raises(InputError, match=cause) as caught:
         require_sound(camera, "one.png", Path("cameras.json"))
     assert str(caught.value).startswith("cameras.json: one.png: ")

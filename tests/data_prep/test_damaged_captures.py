@@ -221,7 +221,7 @@ def test_the_command_line_says_what_it_leaves_out(
         f"data.root={photographs}",
         f"output={tmp_path / 'out'}",
     ]
-    monkeypatch.setattr(logging.root, "handlers", [])  # pytest's, without which stderr is told
+    monkeypatch.setattr(logging.root, "handlers", [])  # without pytest's, warnings go to stderr
     monkeypatch.setattr(sys, "argv", ["", *options, f"{alone}=1", "prep.max_gap_deg=10"])
     with pytest.raises(SystemExit) as ended:
         main()
