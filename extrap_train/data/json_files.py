@@ -103,11 +103,8 @@ class _Text:
 
 
 def _decode_pieces(path: Path) -> Iterator[str]:
-    decoder = codecs.getincrementaldecoder("utf-8-sig")()
     try:
-        for piece in _pieces(path):
-            yield decoder.decode(piece)
-        yield decoder.decode(b"", final=True)
+        yield from codecs.iterdecode(_pieces(path), "utf-8-sig")  # which gives no empty piece
     except UnicodeDecodeError as error:
         _refuse(path, error)
 

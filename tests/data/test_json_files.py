@@ -48,6 +48,16 @@ def test_entries_are_those_of_the_whole_list(
 
 
 @pytest.mark.parametrize("piece", range(1, 8))
+def test_a_character_of_several_bytes_is_whole_wherever_a_piece_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, piece: int
+) -> None:
+    monkeypatch.setattr(json_files, "_PIECE_BYTES", piece)
+    file = tmp_path / "list.json"
+    file.write_text('["é€𐀀", "𐀀é€"]', encoding="utf-8")
+    assert list(read_json_list(file, "things")) == ["é€𐀀", "𐀀é€"]
+
+
+@pytest.mark.parametrize("piece", range(1, 8))
 @pytest.mark.parametrize("number", ["0.0", "-1.5", "1e-05", "2E+3", "-0", "17"])
 def test_a_number_is_whole_wherever_a_piece_ends(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: str, piece: int

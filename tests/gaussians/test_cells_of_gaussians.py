@@ -41,7 +41,9 @@ def results(fork_server: ForkServerContext, tmp_path_factory: pytest.TempPathFac
     (own / "table" / "trouble.yaml").write_text(_TABLE)
     catalogue = Catalogue.with_own([str(own)])
     table = catalogue.table("trouble", [f"output={output}"])
-    assert run_table(table, catalogue, RunOptions(launcher=LocalLauncher(1))) == 1
+    failed = run_table(table, catalogue, RunOptions(launcher=LocalLauncher(1)))
+    cells = _cells(output / "trouble")
+    assert failed == 1, {name: cell["reason"] for name, cell in cells.items()}
     return output / "trouble"
 
 
