@@ -14,7 +14,6 @@ from extrap_train.config import (
     SamplerConfig,
     TrainerConfig,
 )
-from extrap_train.data.module import compute_warp
 from extrap_train.data.queries import query_batch
 from extrap_train.data.scene import open_scene
 from extrap_train.data.scene_views import input_views, select_input_frames
@@ -25,6 +24,7 @@ from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.gaussians.fit import fit_views
 from extrap_train.gaussians.gaussian_model import Gaussians
 from extrap_train.gaussians.gaussian_options import GaussianOptions
+from extrap_train.geometry.warp import compute_warp
 from extrap_train.tasks import complete
 from extrap_train.tasks.scene_model import open_model
 from extrap_train.views import Camera, View, Warp, stack_cameras

@@ -12,9 +12,10 @@ from torch.nn import functional
 
 from data_prep.category_pairs import prepare_category
 from extrap_train.config import DatasetDepthConfig, FlowMatcherConfig, PrepConfig, SyntheticConfig
-from extrap_train.data.module import ValidationBatches, compute_warp
+from extrap_train.data.module import ValidationBatches
 from extrap_train.data.pair_examples import ExampleReader, linspace_indices
 from extrap_train.diffusion.baselines import mean_filled_warp
+from extrap_train.geometry.warp import compute_warp
 from extrap_train.metrics import psnr, quantised
 from extrap_train.views import PairBatch
 

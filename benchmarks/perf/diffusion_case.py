@@ -15,9 +15,9 @@ from torch.utils.flop_counter import FlopCounterMode
 from benchmarks.perf.timing import Row, compare
 from benchmarks.perf.warp_timing import ANGLES_DEG, QUERY_ANGLE_DEG, orbit_camera
 from extrap_train.config import ClipConfig, ModelConfig, UNetConfig, VaeConfig
-from extrap_train.data.module import compute_warp
 from extrap_train.diffusion.encoders import Frozen
 from extrap_train.diffusion.model import ExtrapolationModel, use_channels_last
+from extrap_train.geometry.warp import compute_warp
 from extrap_train.views import PairBatch, stack_cameras
 
 IMAGE_SIZE = 256

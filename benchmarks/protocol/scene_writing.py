@@ -22,12 +22,12 @@ from benchmarks.protocol.prepared_scene import (
 )
 from extrap_train.config import DatasetDepthConfig, DepthConfig, RulesConfig, StereoConfig
 from extrap_train.data.images import to_eight_bits
-from extrap_train.data.module import compute_warp
 from extrap_train.data.queries import query_batch
 from extrap_train.depth import NoDepthError
 from extrap_train.depth.sources import depth_source
 from extrap_train.errors import InputError
 from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
+from extrap_train.geometry.warp import compute_warp
 from extrap_train.store.atomic import atomic_folder
 from extrap_train.store.records import write_record
 from extrap_train.views import Camera, View, stack_cameras

@@ -1,7 +1,6 @@
 """Batches for training and validation, a pure function of the seed and of the step they are for."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 
 import lightning
 import numpy as np
@@ -9,36 +8,11 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 
 from extrap_train.config import TrainConfig
 from extrap_train.data.pair_examples import Example, ExampleReader, linspace_indices, mirror
-from extrap_train.geometry.reduction import reduce_batch
-from extrap_train.geometry.warp import warp_references
+from extrap_train.geometry.warp import compute_warp
 from extrap_train.views import PairBatch
 
 Positions = list[tuple[int, int]]
 """(position in the endless stream of examples, index of the pair)."""
-
-
-def compute_warp(batch: PairBatch, image_size: int | None = None) -> PairBatch:
-    """The batch with its warp, made on the device where the batch lies.
-
-    The warp is made at the batch's own size; then everything is reduced to `image_size`, of which
-    that size is a multiple. None keeps it.
-    """
-    if batch.warp is not None:
-        if image_size not in (None, batch.camera.height):
-            raise ValueError(f"the warp is there already, at {batch.camera.height} pixels")
-        return batch
-    warp = warp_references(
-        batch.reference_images,
-        batch.reference_depths,
-        batch.reference_cameras,
-        batch.reference_valid,
-        batch.camera,
-        batch.reference_flows,
-    )
-    factor, rest = divmod(batch.camera.height, image_size or batch.camera.height)
-    if rest or not factor:
-        raise ValueError(f"{batch.camera.height} pixels are no multiple of {image_size}")
-    return reduce_batch(replace(batch, warp=warp), factor)
 
 
 class PositionSampler(Sampler[Positions]):

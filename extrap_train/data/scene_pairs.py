@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from extrap_train.data.module import compute_warp
 from extrap_train.data.pair_examples import Example, collate
 from extrap_train.data.queries import query_batch
 from extrap_train.depth import require_depth
@@ -23,6 +22,7 @@ from extrap_train.geometry.viewpoints import (
     pairwise_angles,
     scene_center,
 )
+from extrap_train.geometry.warp import compute_warp
 from extrap_train.views import PairBatch, View, stack_cameras
 
 _NEAREST_RAD, _FARTHEST_RAD = np.deg2rad([10, 60])

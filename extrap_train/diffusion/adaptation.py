@@ -14,13 +14,13 @@ from lightning.fabric import Fabric
 from torch import Tensor
 
 from extrap_train.config import LoraConfig, SamplerConfig
-from extrap_train.data.module import compute_warp
 from extrap_train.data.scene_pairs import AdaptationPairs
 from extrap_train.diffusion.conditioning import Conditioning
 from extrap_train.diffusion.loss import Anchor, Unchanged, diffusion_loss, prediction_errors
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sampling_timesteps
 from extrap_train.errors import InputError
+from extrap_train.geometry.warp import compute_warp
 from extrap_train.views import PairBatch, combine
 
 _LEVELS = 4

@@ -9,11 +9,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrap_train.config import SamplerConfig
-from extrap_train.data.module import compute_warp
 from extrap_train.data.queries import query_batch
 from extrap_train.device import autocast
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sample_views
+from extrap_train.geometry.warp import compute_warp
 from extrap_train.views import Camera, View, Warp, combine
 
 

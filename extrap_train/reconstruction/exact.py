@@ -7,11 +7,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrap_train.data.module import compute_warp
 from extrap_train.data.queries import query_batch
 from extrap_train.data.synthetic import SyntheticScene, render, trace
 from extrap_train.depth import DepthMap, PointMaps, point_maps_of
 from extrap_train.diffusion.generator import GeneratedViews
+from extrap_train.geometry.warp import compute_warp
 from extrap_train.geometry.world_frame import WorldFrame
 from extrap_train.reconstruction.completion import REFERENCES
 from extrap_train.views import Camera, View

@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from extrap_train.data.module import compute_warp
+from extrap_train.geometry.warp import compute_warp
 from extrap_train.views import Camera, PairBatch, stack_cameras
 
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 import torch
 
 from extrap_train.config import ModelConfig
-from extrap_train.data.module import compute_warp
 from extrap_train.diffusion.conditioning import (
     Conditioning,
     Null,
@@ -19,6 +18,7 @@ from extrap_train.diffusion.conditioning import (
 from extrap_train.diffusion.encoders import PixelPatches
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.geometry.encoding import coordinate_grid, positional_encoding
+from extrap_train.geometry.warp import compute_warp
 from extrap_train.views import PairBatch
 
 

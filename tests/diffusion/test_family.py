@@ -7,13 +7,13 @@ import torch
 from batches import batch_of
 
 from extrap_train.config import ModelConfig, SamplerConfig
-from extrap_train.data.module import compute_warp
 from extrap_train.diffusion.conditioning import filled_warp
 from extrap_train.diffusion.family import FAMILIES
 from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sample_views
 from extrap_train.errors import InputError
+from extrap_train.geometry.warp import compute_warp
 from extrap_train.views import PairBatch
 
 

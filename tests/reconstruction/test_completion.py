@@ -8,13 +8,13 @@ import scenes
 import torch
 
 from extrap_train.config import CompletionConfig, ConfidenceConfig
-from extrap_train.data.module import compute_warp
 from extrap_train.data.queries import query_batch
 from extrap_train.depth import RELIABLE_CONFIDENCE, DepthMap, PointMaps, point_maps_of
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.diffusion.generator import GeneratedViews
 from extrap_train.errors import InputError
 from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
+from extrap_train.geometry.warp import compute_warp
 from extrap_train.reconstruction.cloud import cloud_of
 from extrap_train.reconstruction.completion import Workshop, complete, map_of_inputs
 from extrap_train.reconstruction.global_map import GENERATED, GlobalMap

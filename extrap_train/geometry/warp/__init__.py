@@ -6,18 +6,19 @@ the method and own its constants; both give the same picture within rounding, an
 same bits for any number of threads.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from extrap_train.geometry.reduction import reduce_batch
 from extrap_train.geometry.warp.sample import move_points, sample_surfaces
 from extrap_train.geometry.warp.sample_numba import move_points_numba, sample_surfaces_numba
 from extrap_train.geometry.warp.splat import OUTSIDE, ScreenPoints, splat_torch
 from extrap_train.geometry.warp.splat_numba import project_numba, splat_numba
-from extrap_train.views import Camera, Warp
+from extrap_train.views import Camera, PairBatch, Warp
 
 NEAREST_SHARE = 0.02
 """Least share of a pixel's weight for which the nearest reference is said to reach it."""
@@ -65,6 +66,30 @@ def warp_references(
         mask=(weight > 0).to(images.dtype),
         nearest_mask=nearest_mask,
     )
+
+
+def compute_warp(batch: PairBatch, image_size: int | None = None) -> PairBatch:
+    """The batch with its warp, made on the device where the batch lies.
+
+    The warp is made at the batch's own size; then everything is reduced to `image_size`, of which
+    that size is a multiple. None keeps it.
+    """
+    if batch.warp is not None:
+        if image_size not in (None, batch.camera.height):
+            raise ValueError(f"the warp is there already, at {batch.camera.height} pixels")
+        return batch
+    warp = warp_references(
+        batch.reference_images,
+        batch.reference_depths,
+        batch.reference_cameras,
+        batch.reference_valid,
+        batch.camera,
+        batch.reference_flows,
+    )
+    factor, rest = divmod(batch.camera.height, image_size or batch.camera.height)
+    if rest or not factor:
+        raise ValueError(f"{batch.camera.height} pixels are no multiple of {image_size}")
+    return reduce_batch(replace(batch, warp=warp), factor)
 
 
 @dataclass(frozen=True)
