@@ -1,10 +1,8 @@
 """Fixtures that every test may use, and how the tests share the machine."""
 
-import multiprocessing
 import os
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from multiprocessing import forkserver
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
 
@@ -56,14 +54,17 @@ def shared() -> Path:
 
 @pytest.fixture(scope="session")
 def fork_server() -> ForkServerContext:
-    """Starts processes that need import nothing, methods under test among them.
+    """Starts processes that need import nothing, methods under test among them."""
+    from extrap_train.jobs.fork_server import start_fork_server
 
-    A process has one such server, and the first who starts it decides what it has imported.
-    """
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([*_FORKED])
-    forkserver.ensure_running()
-    return context
+    return start_fork_server(_FORKED)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _fork_server_of_a_worker(request: pytest.FixtureRequest) -> None:
+    """A test that starts a server for itself would decide what that of the others imports."""
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        request.getfixturevalue("fork_server")
 
 
 def _use_one_thread() -> None:

@@ -15,15 +15,14 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
-from functools import cached_property
 from multiprocessing import reduction
 from multiprocessing.connection import wait as wait_for_any
-from multiprocessing.context import ForkServerContext
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import IO, Any
 
 from extrap_train.jobs import ONE_THREAD, Died, Item
+from extrap_train.jobs.fork_server import start_fork_server
 
 MAX_RESULT_BYTES = 2**30
 _TIMED_OUT = 124
@@ -82,21 +81,9 @@ class GuestLauncher:
                         yield index, guest.result()
 
     def _start(self, arguments: tuple[Any, ...]) -> BaseProcess:
-        process = self._context.Process(target=_keep, args=arguments)
-        before = dict(os.environ)
-        os.environ |= dict.fromkeys(ONE_THREAD, "1")  # the server reads them as it starts
-        try:
-            process.start()
-        finally:
-            os.environ.clear()
-            os.environ.update(before)
+        process = start_fork_server(self.preload).Process(target=_keep, args=arguments)
+        process.start()
         return process
-
-    @cached_property
-    def _context(self) -> ForkServerContext:
-        context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload([*self.preload])
-        return context
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
@@ -12,6 +12,7 @@ from multiprocessing.connection import wait as wait_for_any
 from types import TracebackType
 
 from extrap_train.jobs import ONE_THREAD, Died, Item, Result
+from extrap_train.jobs.fork_server import start_fork_server
 
 WAITING_PER_WORKER = 2
 """Jobs that are handed out ahead of time: memory must not grow with the number of jobs."""
@@ -110,11 +111,14 @@ class LocalLauncher:
                 return self._pool.submit(job, item)
             except BrokenProcessPool:
                 self._close()
-        # Spawned, not forked: the parent may hold threads and a GPU.
-        context = multiprocessing.get_context("spawn")
+        # Forked by a server, not by this process, which may hold threads and a GPU.
+        context = start_fork_server({job.__module__} - {"__main__"})
         leave, self._stay = context.Pipe(duplex=False)
         self._pool = ProcessPoolExecutor(
-            self.workers, mp_context=context, initializer=_prepare_worker, initargs=(leave,)
+            self.workers,
+            mp_context=context,
+            initializer=_prepare_worker,
+            initargs=(leave, os.environ | dict.fromkeys(ONE_THREAD, "1")),
         )
         return self._pool.submit(job, item)
 
@@ -124,12 +128,13 @@ class LocalLauncher:
             self._pool = None
 
 
-def _prepare_worker(leave: Connection) -> None:
+def _prepare_worker(leave: Connection, environment: Mapping[str, str]) -> None:
     """One thread per worker, and no worker without its parent: it leaves when that has died or is
     interrupted, and is deaf to the Ctrl-C that reaches both.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.environ |= dict.fromkeys(ONE_THREAD, "1")
+    os.environ.clear()
+    os.environ |= environment
     parent = multiprocessing.parent_process()
     assert parent is not None
 

@@ -11,11 +11,12 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from extrap_train.config import SlurmConfig
 from extrap_train.errors import InputError
-from extrap_train.jobs import Died, Launcher
+from extrap_train.jobs import ONE_THREAD, Died, Launcher
 from extrap_train.jobs.local import LocalLauncher
 from extrap_train.jobs.slurm import SubmittedLauncher, open_launcher, slurm_launcher
 
@@ -111,31 +112,40 @@ def test_a_cluster_is_asked_for_with_the_first_jobs_only(
             list(launcher.run(square, [1]))
 
 
-def test_workers_do_not_outlive_a_killed_parent(tmp_path: Path) -> None:
+def test_workers_of_one_thread_do_not_outlive_a_killed_parent(tmp_path: Path) -> None:
+    """Their job stands in the script that starts them."""
     program = (
         "from test_launchers import linger\n"
         "from extrap_train.jobs.local import LocalLauncher\n"
+        "def job(folder):\n"
+        "    linger(folder)\n"
         "if __name__ == '__main__':\n"
         "    with LocalLauncher(2) as local:\n"
-        f"        list(local.run(linger, [{str(tmp_path)!r}] * 2))\n"
+        f"        list(local.run(job, [{str(tmp_path)!r}] * 2))\n"
     )
     script = tmp_path / "parent.py"
     script.write_text(program)
-    parent = subprocess.Popen([sys.executable, str(script)])
+    environment = {name: value for name, value in os.environ.items() if name not in ONE_THREAD}
+    parent = subprocess.Popen([sys.executable, str(script)], env=environment)
     while len(list(tmp_path.glob("*.pid"))) < 2:
         assert parent.poll() is None
         time.sleep(0.02)
     parent.send_signal(signal.SIGKILL)
     parent.wait()
-    pids = [int(path.stem) for path in tmp_path.glob("*.pid")]
+    lingering = list(tmp_path.glob("*.pid"))
+    assert {path.read_text() for path in lingering} == {"2"}  # one waits for the parent's end
     deadline = time.monotonic() + 10
-    while any(map(_is_alive, pids)):
+    while any(_is_alive(int(path.stem)) for path in lingering):
         assert time.monotonic() < deadline
         time.sleep(0.02)
 
 
 def linger(folder: str) -> None:
-    (Path(folder) / f"{os.getpid()}.pid").touch()
+    """Say how many threads there are, then wait."""
+    np.ones((500, 500)) @ np.ones((500, 500))
+    said = Path(folder) / f"{os.getpid()}.part"
+    said.write_text(str(len(list(Path("/proc/self/task").iterdir()))))
+    said.rename(said.with_suffix(".pid"))
     time.sleep(60)
 
 
