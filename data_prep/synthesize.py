@@ -22,7 +22,13 @@ from extrap_train.data.synthetic import (
 )
 from extrap_train.errors import InputError
 from extrap_train.jobs import Died, Launcher
-from extrap_train.store.atomic import install_folder, partial_path, remove_leftovers, write_atomic
+from extrap_train.store.atomic import (
+    install_folder,
+    link_target,
+    partial_path,
+    remove_leftovers,
+    write_atomic,
+)
 from extrap_train.store.records import read_record, write_record
 from extrap_train.terminal import track
 
@@ -171,7 +177,8 @@ def _render_sequence(job: _Job) -> None:
     scene = build_scene(job.category, job.index, options["seed"])
     seed = walk_seed(job.category, job.index, options["seed"])
     cameras = handheld_orbit(scene, options["frames"], options["image_size"], seed)
-    workshop = partial_path(job.folder)
+    place = link_target(job.folder)
+    workshop = partial_path(place)
     try:
         frames = [
             write_frame(workshop, job.category, job.name, number, render(scene, cameras[number]))
@@ -187,7 +194,7 @@ def _render_sequence(job: _Job) -> None:
         )
         made = workshop / job.category / job.name
         write_record(made / RECORD, _Record(options, frames, sequence))
-        install_folder(made, job.folder, lambda _: _state(job) == "ready")
+        install_folder(made, place, lambda _: _state(job) == "ready")
     finally:
         shutil.rmtree(workshop, ignore_errors=True)
 

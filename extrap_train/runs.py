@@ -269,6 +269,8 @@ def point_latest(folder: RunFolder) -> None:
     if in_sweep():
         return
     link = folder.path.with_name(_LATEST)
+    if link.is_dir() and not link.is_symlink():  # as where the runs were copied without links
+        raise InputError(f"{link}: is a folder, not the link to the latest run; rename it")
     temporary = partial_path(link)
     temporary.unlink(missing_ok=True)
     temporary.symlink_to(folder.path.name)

@@ -105,6 +105,14 @@ def test_latest_is_the_run_that_was_opened_last(config: TrainConfig, tmp_path: P
     assert latest.resolve() == first.path.resolve()
 
 
+def test_a_folder_called_latest_is_not_replaced(config: TrainConfig, tmp_path: Path) -> None:
+    latest = tmp_path / "train/hydrant/small/latest"
+    latest.mkdir(parents=True)
+    with pytest.raises(InputError, match="latest: is a folder"):
+        opened(config)
+    assert latest.is_dir()
+
+
 def test_other_options_are_another_run(config: TrainConfig) -> None:
     assert opened(replace(config, seed=1)) != opened(config)
 

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import shutil
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -19,7 +18,7 @@ from extrap_train.diffusion.published.config_compat import SCHEDULER, require_sa
 from extrap_train.diffusion.published.read import SOURCES, Shapes, read_published, weights_at
 from extrap_train.diffusion.transfer import narrowed, turned_pose, widened
 from extrap_train.errors import InputError
-from extrap_train.store.atomic import partial_path
+from extrap_train.store.atomic import atomic_folder
 from extrap_train.store.records import read_record, write_record
 from extrap_train.weight_files import WeightFile, write_tensors
 
@@ -40,9 +39,7 @@ def save_model(model: ExtrapolationModel, folder: Path, dtype: torch.dtype = tor
 
     The folder appears complete or not at all; an older one of that name is replaced.
     """
-    temporary = partial_path(folder)
-    shutil.rmtree(temporary, ignore_errors=True)
-    try:
+    with atomic_folder(folder) as temporary:
         write_record(temporary / MODEL_CONFIG, model.config)
         for part, network in model.parts().items():
             (temporary / part).mkdir()
@@ -55,11 +52,6 @@ def save_model(model: ExtrapolationModel, folder: Path, dtype: torch.dtype = tor
             model.parts()["vae"].save_config(temporary / "vae")
         if model.config.clip is not None:
             model.parts()["image_encoder"].config.save_pretrained(temporary / "image_encoder")
-        if folder.exists():
-            shutil.rmtree(folder)
-        temporary.replace(folder)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def save_compact(model: ExtrapolationModel, folder: Path, base: str = "base") -> None:

@@ -17,13 +17,20 @@ from jaxtyping import Shaped
 
 from extrap_train.errors import InputError
 
-_WRITER = re.compile(r"\.(?P<host>[^.]+)-(?P<pid>\d+)(\.[^.]+)?\.tmp$")
+_REPLACED = ".replaced"
+_PARTIAL = re.compile(r"\.(?P<name>.+)\.(?P<host>[^.]+)-(?P<pid>\d+)(\.[^.]+)?\.tmp", re.DOTALL)
+"""A name that `partial_path` gives."""
 _ABANDONED_S = 24 * 3600.0
 
 
 def partial_path(path: Path) -> Path:
     """Where this process writes what is to become `path`; says whose it is (`remove_leftovers`)."""
     return path.with_name(f".{path.name}.{_host()}-{os.getpid()}.tmp")
+
+
+def link_target(path: Path) -> Path:
+    """Where a path leads once every link in it is followed, which need not exist."""
+    return Path(os.path.realpath(path))  # `Path.resolve` raises where links form a circle
 
 
 def write_atomic(path: Path, content: bytes) -> None:
@@ -86,8 +93,10 @@ def atomic_folder(
 ) -> Iterator[Path]:
     """A new folder that `install_folder` puts in place at the end, or of which nothing remains.
 
-    Modes follow the umask, whatever library writes the files.
+    Where `folder` is a link, the link stays and its target is replaced. Modes follow the
+    umask, whatever library writes the files.
     """
+    folder = link_target(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     own = partial_path(folder)
     made = own.with_name(f"{own.stem}.{secrets.token_hex(4)}{own.suffix}")
@@ -129,7 +138,7 @@ def install_folder(made: Path, folder: Path, is_wanted: Callable[[Path], bool]) 
     with FileLock(folder.parent / ".lock"):
         if is_wanted(folder):
             return
-        replaced = partial_path(folder.with_name(f"{folder.name}.replaced"))
+        replaced = partial_path(folder.with_name(folder.name + _REPLACED))
         if folder.exists():
             shutil.rmtree(replaced, ignore_errors=True)  # of an earlier process of the same number
             folder.rename(replaced)
@@ -138,14 +147,18 @@ def install_folder(made: Path, folder: Path, is_wanted: Callable[[Path], bool]) 
     shutil.rmtree(replaced, ignore_errors=True)
 
 
-def remove_leftovers(folder: Path) -> None:
-    """Remove the `.*.tmp` that killed writers have left in a folder, which need not exist.
+def remove_leftovers(folder: Path, of: str = "") -> None:
+    """Remove what killed writers have left in a folder (`partial_path`), which need not exist.
 
-    What another process that lives still writes is left alone; of one on another machine it is
-    removed after a day. This process must not be writing there.
+    With `of`, only what was to become the file or folder of that name. What another process that
+    lives still writes is left alone; of one on another machine it is removed after a day. This
+    process must not be writing there.
     """
     for path in folder.glob(".*.tmp"):
-        if _is_being_written(path):
+        partial = _PARTIAL.fullmatch(path.name)
+        if partial is None or _is_being_written(path, partial):
+            continue
+        if of and partial["name"].removesuffix(_REPLACED) != of:
             continue
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)  # another process may be removing it too
@@ -153,19 +166,18 @@ def remove_leftovers(folder: Path) -> None:
             path.unlink(missing_ok=True)
 
 
-def _is_being_written(path: Path) -> bool:
+def _is_being_written(path: Path, partial: re.Match[str]) -> bool:
     """Whether its writer may be alive; what vanishes meanwhile is one's who is."""
-    writer = _WRITER.search(path.name)
-    if writer is None or writer["pid"] == str(os.getpid()):
+    if partial["pid"] == str(os.getpid()):
         return False
-    if writer["host"] != _host():
+    if partial["host"] != _host():
         try:
             newest = max(p.stat().st_mtime for p in (path, *path.rglob("*")))
         except FileNotFoundError:
             return True
         return time.time() - newest < _ABANDONED_S
     try:
-        os.kill(int(writer["pid"]), 0)
+        os.kill(int(partial["pid"]), 0)
     except ProcessLookupError:
         return False
     except PermissionError:

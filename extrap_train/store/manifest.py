@@ -3,6 +3,7 @@ refused by what it was made from.
 """
 
 import json
+import os
 import subprocess
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from extrap_train.errors import InputError
-from extrap_train.store.atomic import atomic_folder, file_lock, remove_leftovers
+from extrap_train.store.atomic import atomic_folder, file_lock, link_target, remove_leftovers
 from extrap_train.store.records import read_record, write_record
 
 MANIFEST = "manifest.json"
@@ -138,6 +139,10 @@ def code_version() -> str:
 
 
 REMEDY = "use run=NAME for a new folder or resume=false to replace it"
+_LEFT_ALONE = (
+    "what lies there is not known to be a result and is left alone: move it, or give another run= "
+    "or output="
+)
 
 
 class Conflict(InputError):
@@ -175,20 +180,25 @@ def claim(
 ) -> Iterator[Claim]:
     """Hold a result's folder for this process alone as long as the block lasts.
 
-    Leftovers of killed writers are removed. With `resume`, what lies there must be of the same
-    manifest (`Conflict`); without, it is to be replaced. Raises InputError if another process
-    holds the folder.
+    A link is followed. Leftovers of killed writers are removed. With `resume`, what lies there must
+    be of the same manifest (`Conflict`); without, it is to be replaced. Raises InputError if
+    another process holds the folder, or if anything lies there that does not say that it is a
+    result, which is left alone.
     """
-    folder.parent.mkdir(parents=True, exist_ok=True)
+    place = link_target(folder)
+    place.parent.mkdir(parents=True, exist_ok=True)
     taken = f"{folder}: another process is writing this result; wait for it or give run=NAME"
-    with file_lock(folder.with_name(f".{folder.name}.lock"), taken):
-        is_reused = resume and folder.exists()
-        if is_reused:
+    with file_lock(place.with_name(f".{place.name}.lock"), taken):
+        is_empty = place.is_dir() and not any(place.iterdir())
+        is_there = os.path.lexists(place) and not is_empty
+        if is_there:
+            read_manifest(folder, _LEFT_ALONE)
+        if is_there and resume:
             require_same(folder, manifest, remedy)
-        remove_leftovers(folder.parent)
-        for part in (folder, *(path for path in folder.rglob("*") if path.is_dir())):
+        remove_leftovers(place.parent, of=place.name if folder.is_symlink() else "")
+        for part in (place, *(path for path in place.rglob("*") if path.is_dir())):
             remove_leftovers(part)
-        yield Claim(folder, manifest, is_reused)
+        yield Claim(place, manifest, is_there and resume)
 
 
 def require_same(folder: Path, manifest: Manifest, remedy: str = REMEDY) -> None:

@@ -47,7 +47,7 @@ from extrap_train.runs import (
 )
 from extrap_train.store import Outcome
 from extrap_train.store.manifest import REMEDY, Conflict, Manifest, claim
-from extrap_train.tasks.results import draw_curve, draw_views, write_results
+from extrap_train.tasks.results import draw_curve, draw_views, print_places, write_results
 from extrap_train.tasks.training_data import Prepare, data_module, require_unseen
 from extrap_train.terminal import terminal
 
@@ -83,6 +83,7 @@ def run(config: TrainConfig, prepare: Prepare) -> Outcome:
                 draw_curve(folder)
                 steps = training.validated_step
                 write_results(training, prepared, missing, seconds, steps, folder, console)
+                print_places(folder, console)
         if is_first():  # a longer training goes on from the newest, but for a sweep's job
             thin_checkpoints(folder.checkpoints, keep=0 if in_sweep() else 1)
     return Outcome(folder.path, opening.is_finished)

@@ -56,6 +56,10 @@ def write_results(
     console.print(_table(validation))
     for name, reason in missing.items():
         console.print(f"missing {name}: {reason}")
+
+
+def print_places(folder: RunFolder, console: Console) -> None:
+    """Say where `write_results` has left what it made."""
     console.print(f"pictures: {folder.samples / 'final.png'}\nresult: {folder.path}")
 
 

@@ -15,10 +15,9 @@ from extrap_train.metrics import lpips_or_reason
 from extrap_train.runs import Finished, RunFolder, existing_run, trained_on
 from extrap_train.store import Outcome
 from extrap_train.store.digests import folder_digest
-from extrap_train.store.manifest import MANIFEST, Conflict, Manifest, claim, read_manifest
-from extrap_train.store.records import write_record
+from extrap_train.store.manifest import Conflict, Manifest, claim, read_manifest
 from extrap_train.tasks.category import quiet_trainer, quieten_lightning
-from extrap_train.tasks.results import write_results
+from extrap_train.tasks.results import print_places, write_results
 from extrap_train.tasks.scene_model import require_saved_options
 from extrap_train.tasks.training_data import Prepare, data_module, require_unseen
 from extrap_train.terminal import terminal
@@ -30,7 +29,7 @@ def run(config: TrainConfig, prepare: Prepare) -> Outcome:
     Views are sampled as the model recommends, but for what `config.sampler` says, and in the
     model's own groups.
     """
-    trained = existing_run(config)
+    trained, console = existing_run(config), terminal()
     started = time.perf_counter()
     prepared = prepare(config)
     _require_as_trained(trained, config, prepared)
@@ -42,7 +41,7 @@ def run(config: TrainConfig, prepare: Prepare) -> Outcome:
     digest = hashlib.sha256(json.dumps(options, sort_keys=True).encode()).hexdigest()[:8]
     folder = RunFolder(trained.path / "validations" / f"seed{config.seed}-{digest}")
     manifest = Manifest.of(dotted(options), {"model": folder_digest(trained.model)})
-    with claim(folder.path, manifest, resume=False):
+    with claim(folder.path, manifest, resume=False) as result:
         quieten_lightning()
         distance, missing = lpips_or_reason(config.validation.lpips_weights)
         pairs = data_module(replace(config, model=model.config), prepared)
@@ -52,8 +51,9 @@ def run(config: TrainConfig, prepare: Prepare) -> Outcome:
         trainer = quiet_trainer(config.trainer, devices=1, logger=False)
         trainer.validate(validation, pairs, verbose=False)
         seconds["validate"] = validation.validation_seconds
-        write_results(validation, prepared, missing, seconds, steps, folder, terminal())
-        write_record(folder.path / MANIFEST, manifest)
+        with result.replace() as made:
+            write_results(validation, prepared, missing, seconds, steps, RunFolder(made), console)
+        print_places(folder, console)
     return Outcome(folder.path)
 
 

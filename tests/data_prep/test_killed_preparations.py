@@ -14,6 +14,8 @@ from pathlib import Path
 import pytest
 from captures import write_capture
 
+from extrap_train.store.atomic import partial_path
+
 pytestmark = pytest.mark.slow  # starting a dozen processes takes more than what they do
 
 SEQUENCES, FRAMES = 8, 12
@@ -91,8 +93,10 @@ def test_a_killed_run_goes_on_and_ends_with_the_same_bytes(
     assert 0 < len(done) < SEQUENCES, "killed in the middle"
     frames = next(tmp_path.glob("frames/cup-*/frames/cup"))
     # As if it had been killed between two files of a sequence, too.
-    (frames / ".s7.abc.tmp").mkdir()
-    (frames / ".s7.abc.tmp" / "images.npy").write_bytes(b"half of")
+    half = partial_path(frames / "s7")
+    half = half.with_name(half.name.replace(f"-{os.getpid()}.", f"-{run.pid}."))
+    half.mkdir()
+    (half / "images.npy").write_bytes(b"half of")
     finish(start(photographs, tmp_path))
     assert contents(tmp_path) == undisturbed
     assert {file: file.stat().st_mtime_ns for file in done} == done

@@ -117,6 +117,15 @@ def test_a_download_that_was_unpacked_over_synthetic_captures_is_left_as_it_is(r
     assert contents(root) == before
 
 
+def test_a_sequence_that_lies_elsewhere_by_a_link_is_rendered_again_there(root, tmp_path):
+    link, elsewhere = root / "apple" / "0001", tmp_path / "elsewhere"
+    link.rename(elsewhere)
+    link.symlink_to(elsewhere)
+    synthesize(replace(SMALL, frames=2), "apple", root, LocalLauncher(1))
+    assert link.readlink() == elsewhere
+    assert len(list((elsewhere / "images").iterdir())) == 2
+
+
 def test_half_of_a_rendering_is_removed_but_not_a_living_ones(root):
     half = partial_path(root / "apple" / "0000")
     (half / "apple" / "0000").mkdir(parents=True)

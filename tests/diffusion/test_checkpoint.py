@@ -30,7 +30,21 @@ def test_a_model_comes_back_as_it_was(config: ModelConfig, tmp_path: Path) -> No
         model.state_dict().items(), loaded.state_dict().values(), strict=True
     ):
         assert torch.equal(before, after), name
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["model"], "nothing half-written is left"
+    left = {path.name for path in tmp_path.iterdir()} - {".lock"}
+    assert left == {"model"}, "nothing half-written is left"
+
+
+def test_a_model_that_lies_elsewhere_by_a_link_is_replaced_there(
+    config: ModelConfig, tmp_path: Path
+) -> None:
+    elsewhere, link = tmp_path / "disk" / "model", tmp_path / "run" / "model"
+    save_model(ExtrapolationModel(config), elsewhere)
+    link.parent.mkdir()
+    link.symlink_to(elsewhere)
+    newer = ExtrapolationModel(config)
+    save_model(newer, link)
+    assert link.is_symlink()
+    assert torch.equal(load_model(elsewhere).unet.conv_in.weight, newer.unet.conv_in.weight)
 
 
 def test_plain_diffusers_loads_the_folder(config: ModelConfig, tmp_path: Path) -> None:
@@ -123,7 +137,7 @@ def test_a_full_disk_leaves_the_older_model(
     monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(InputError, match="No space left on device"):
         save_model(ExtrapolationModel(config), tmp_path / "model")
-    assert [path.name for path in tmp_path.iterdir()] == ["model"]
+    assert {path.name for path in tmp_path.iterdir()} - {".lock"} == {"model"}
     weight = load_model(tmp_path / "model").image_encoder[0].weight
     assert torch.equal(weight, older.image_encoder[0].weight)
 

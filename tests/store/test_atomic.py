@@ -113,20 +113,22 @@ def test_processes_that_write_one_folder_do_not_collide(tmp_path):
 
 
 def test_only_what_nobody_writes_any_more_is_removed(tmp_path):
+    users = tmp_path / ".draft.tmp"
+    users.write_text("not a name that a writer of ours gives")
     living = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
     own = partial_path(tmp_path / "own").name
     name = {who: own.replace(f"-{os.getpid()}.", f"-{who}.") for who in (living.pid, dead.pid)}
     elsewhere, long_ago = ".one.other_host-7.abc.tmp", ".two.other_host-7.abc.tmp"
-    for folder in (own, *name.values(), elsewhere, long_ago, ".from_before.tmp"):
+    for folder in (own, *name.values(), elsewhere, long_ago):
         (tmp_path / folder).mkdir()
     os.utime(tmp_path / long_ago, (0, 0))
     remove_leftovers(tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {name[living.pid], elsewhere}
+    assert {path.name for path in tmp_path.iterdir()} == {users.name, name[living.pid], elsewhere}
     living.communicate()
     remove_leftovers(tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {elsewhere}
+    assert {path.name for path in tmp_path.iterdir()} == {users.name, elsewhere}
 
 
 @pytest.mark.parametrize(

@@ -96,10 +96,22 @@ def test_a_folder_that_says_not_what_it_is_of_is_left_alone(refused, weights, tm
         mine = tmp_path / task[0].removeprefix("task=") / "mine"
         mine.mkdir(parents=True)
         (mine / "thesis.txt").write_text("years of work")
-        said = refused(*task, f"weights={weights}", "run=mine")
-        assert "mine/manifest.json: cannot be read" in said
-        assert "run=NAME" in said
-        assert [path.name for path in mine.iterdir()] == ["thesis.txt"]
+        for resume in ("true", "false"):
+            said = refused(*task, f"weights={weights}", "run=mine", f"resume={resume}")
+            assert "mine/manifest.json: cannot be read" in said
+            assert "another run=" in said
+            assert [path.name for path in mine.iterdir()] == ["thesis.txt"]
+
+
+def test_a_link_to_a_folder_elsewhere_takes_the_result_there(command, weights, tmp_path) -> None:
+    elsewhere, link = tmp_path / "disk" / "walks", tmp_path / "view" / "mine"
+    elsewhere.mkdir(parents=True)
+    link.parent.mkdir()
+    link.symlink_to(elsewhere)
+    for pose in ("frame000003", "frame000005"):
+        command("task=view", f"weights={weights}", "run=mine", f"pose={pose}")
+        assert link.is_symlink()
+        assert (elsewhere / "views" / f"{pose}.png").is_file()
 
 
 @pytest.mark.parametrize("task", [["task=scene", *_SHORT], ["task=view", "pose=frame000003"]])
