@@ -1,4 +1,4 @@
-"""Warp correction: where a pair's warp really belongs in its query view (METHOD §6, paper III-A.1).
+"""Warp correction: where a pair's warp really belongs in its query view (paper III-A.1).
 
 Wrong depths shift the warped image against the true one. A matcher finds where the warp's pixels
 are in the truth, a smooth flow is fitted to what is no outlier, and the warp is drawn again with
@@ -22,7 +22,7 @@ from extrap_train.geometry.warp import warp_references
 from extrap_train.matching import Matcher
 from extrap_train.views import Camera, View, Warp, stack_cameras
 
-METHOD = 3
+CORRECTION_VERSION = 3
 """Raised whenever the same frames give other corrections, so that old ones are made anew."""
 LEAST_MATCHES = 40
 """Fewer do not tell a smooth motion from chance."""

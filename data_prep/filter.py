@@ -1,4 +1,4 @@
-"""Which captures are good enough to learn from (METHOD §6, paper III-A.1)."""
+"""Which captures are good enough to learn from (paper III-A.1)."""
 
 import logging
 import math

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from data_prep.correct import METHOD as CORRECTION_METHOD
+from data_prep.correct import CORRECTION_VERSION
 from data_prep.drop_summary import group_reasons
 from data_prep.filter import judge_all
 from data_prep.model_cache import PrepModels, release_models
@@ -19,7 +19,7 @@ from data_prep.tables import Outcome, write_results
 from extrap_train.config import DepthConfig, MatcherConfig, PrepConfig
 from extrap_train.data.prepared import FORMAT, PreparedData
 from extrap_train.data.sequences import FrameSequence
-from extrap_train.data.square_frames import METHOD, CaptureKeys, too_many_unusable
+from extrap_train.data.square_frames import FRAMES_VERSION, CaptureKeys, too_many_unusable
 from extrap_train.depth import DepthSource
 from extrap_train.errors import InputError
 from extrap_train.jobs import Died, Launcher
@@ -56,7 +56,7 @@ class _Plan:
         """Looks at the files of every capture, once."""
         models, options = context.models, context.options
         test = test_names if isinstance(test_names, int) else sorted(test_names)
-        settings = [FORMAT, asdict(options), test, repr(models), METHOD, CORRECTION_METHOD]
+        settings = [FORMAT, asdict(options), test, repr(models), FRAMES_VERSION, CORRECTION_VERSION]
         digest = hashlib.sha256(json.dumps(settings).encode())
         depth, size = models.depth_identity, options.image_size
         capture_keys = []

@@ -1,4 +1,4 @@
-"""Which frames of a sequence become pairs (METHOD §6, paper III-A.1)."""
+"""Which frames of a sequence become pairs (paper III-A.1)."""
 
 from dataclasses import dataclass
 

@@ -18,7 +18,7 @@ import pyarrow as pa
 import torch
 from jaxtyping import Bool, Float
 
-from data_prep.correct import METHOD, correct_pair
+from data_prep.correct import CORRECTION_VERSION, correct_pair
 from data_prep.model_cache import PrepModels
 from data_prep.select import select_pairs
 from extrap_train.config import PrepConfig
@@ -74,7 +74,7 @@ class PrepContext:
     def correction(self) -> str:
         """How warps are corrected; empty where they are not."""
         identity = self.models.correction_identity
-        return identity and f"{identity}, method {METHOD}"
+        return identity and f"{identity}, version {CORRECTION_VERSION}"
 
 
 @dataclass(frozen=True)

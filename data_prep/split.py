@@ -1,4 +1,4 @@
-"""What is trained on and what is tested on (METHOD §6)."""
+"""What is trained on and what is tested on."""
 
 import hashlib
 import json

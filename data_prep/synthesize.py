@@ -178,25 +178,25 @@ def _render_sequence(job: _Job) -> None:
     seed = walk_seed(job.category, job.index, options["seed"])
     cameras = handheld_orbit(scene, options["frames"], options["image_size"], seed)
     place = link_target(job.folder)
-    workshop = partial_path(place)
+    temporary = partial_path(place)
     try:
         frames = [
-            write_frame(workshop, job.category, job.name, number, render(scene, cameras[number]))
+            write_frame(temporary, job.category, job.name, number, render(scene, cameras[number]))
             for number in range(options["frames"])
         ]
         cloud = surface_points(scene, CLOUD_POINTS)
         sequence = write_sequence(
-            workshop,
+            temporary,
             job.category,
             job.name,
             torch.from_numpy(cloud.points).float(),
             torch.from_numpy(cloud.colors).float(),
         )
-        made = workshop / job.category / job.name
+        made = temporary / job.category / job.name
         write_record(made / RECORD, _Record(options, frames, sequence))
         install_folder(made, place, lambda _: _state(job) == "ready")
     finally:
-        shutil.rmtree(workshop, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _annotate(root: Path, category: str, records: list[_Record], test_sequences: int) -> None:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
         warp_view,
     )
     from extrap_train.config import StereoConfig
-    from extrap_train.data.scene import open_scene
+    from extrap_train.data.scene_spec import open_scene
     from extrap_train.errors import InputError
     from extrap_train.gaussians.ply import write_splats
     from extrap_train.pictures import save_picture
@@ -29,7 +29,7 @@ _MODULES = {
         "complete_scene", "fit_gaussians", "open_generator", "open_views", "score_method",
         "warp_view",
     ),
-    "extrap_train.data.scene": ("open_scene",),
+    "extrap_train.data.scene_spec": ("open_scene",),
     "extrap_train.tasks.view": ("walk_around",),
     "extrap_train.views": ("Camera", "View", "Warp", "stack_cameras"),
     "extrap_train.config": ("StereoConfig",),

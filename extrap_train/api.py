@@ -15,7 +15,7 @@ from extrap_train.config import (
     TrainerConfig,
 )
 from extrap_train.data.queries import query_batch
-from extrap_train.data.scene import open_scene
+from extrap_train.data.scene_spec import open_scene
 from extrap_train.data.scene_views import input_views, select_input_frames
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.depth.sources import depth_source

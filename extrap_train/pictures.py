@@ -150,10 +150,10 @@ def film(images: Float[Tensor, "n 3 h w"], path: Path, frames_per_second: int = 
     """
     frames = _enlarged(to_eight_bits(images).transpose(0, 2, 3, 1))
     # A folder: the writers go by the file's suffix.
-    workshop = partial_path(path)
+    temporary = partial_path(path)
     try:
-        workshop.mkdir(parents=True, exist_ok=True)
-        made = workshop / path.name
+        temporary.mkdir(parents=True, exist_ok=True)
+        made = temporary / path.name
         if path.suffix == ".gif":
             _write_gif(frames, made, frames_per_second)
         else:
@@ -165,7 +165,7 @@ def film(images: Float[Tensor, "n 3 h w"], path: Path, frames_per_second: int = 
             "folder"
         ) from None
     finally:
-        shutil.rmtree(workshop, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _enlarged(pixels: np.ndarray) -> np.ndarray:

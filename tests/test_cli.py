@@ -345,7 +345,7 @@ def test_a_start_that_is_no_model_lists_those_in_the_package(
         ([], []),
     ],
 )
-def test_photographs_larger_than_what_is_painted_are_noted(
+def test_photographs_larger_than_what_is_generated_are_noted(
     words: list[str],
     notes: list[str],
     monkeypatch: pytest.MonkeyPatch,

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
-from extrap_train.data.scene import open_scene
+from extrap_train.data.scene_spec import open_scene
 from extrap_train.gaussians.ply import read_splats
 from extrap_train.gaussians.rasterize import draw, rasterizer
 from extrap_train.metrics import psnr

@@ -156,7 +156,7 @@ def _kill_within(output: Path, module: str, owner: str, name: str, where: str) -
     assert process.returncode == -signal.SIGKILL, _said(output)
 
 
-_WITHIN_CHECKPOINT = ("extrap_train.diffusion.resume", "torch", "save", "step-00000006")
+_WITHIN_CHECKPOINT = ("extrap_train.diffusion.checkpoints", "torch", "save", "step-00000006")
 _WITHIN_VALIDATION = ("extrap_train.diffusion", "evaluation", "sample_views", "")
 
 

@@ -11,8 +11,8 @@ from tiny_job import TINY
 
 from extrap_train.__main__ import main
 from extrap_train.diffusion import training
-from extrap_train.diffusion.checkpoint import load_model, save_model
 from extrap_train.diffusion.loss import diffusion_loss
+from extrap_train.diffusion.model_files import load_model, save_model
 
 _OPTIONS = [*TINY, "trainer.steps=4", "trainer.checkpoint_every=4", "validation.examples=2"]
 _OPTIONS += [

@@ -1,4 +1,4 @@
-"""A diffusion method that adapts its model to the capture before it paints (paper II-B)."""
+"""A diffusion method that first adapts its model to the capture (paper II-B)."""
 
 from dataclasses import dataclass, replace
 
@@ -17,7 +17,7 @@ from extrap_train.diffusion.model import ExtrapolationModel
 
 @dataclass(frozen=True)
 class AdaptedDiffusion(Diffusion):
-    """Trains an adapter on pairs made of the inputs, and paints with it (METHOD §4).
+    """Trains an adapter on pairs made of the inputs, and generates the targets with it.
 
     The adapter is this scene's: the model is handed on as it was. Training is preprocessing and
     part of the time, which is spread over the scene's images as that of estimated depth is.

@@ -26,9 +26,9 @@ from extrap_train.config import (
     sampler_for,
 )
 from extrap_train.config.options import option, unset
-from extrap_train.diffusion.checkpoint import load_model
 from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.model_files import load_model
 from extrap_train.diffusion.packaged import packaged_name, packaged_weights
 from extrap_train.errors import InputError
 from extrap_train.store.digests import files_below
@@ -77,8 +77,9 @@ class Diffusion:
         return list(files_below(self._folder(category)))
 
     def synthesize(self, inputs: SceneInputs) -> Synthesis:
-        """Paint every target; the time is that of a single image, its share of all that the scene
-        takes once everything is compiled and loaded.
+        """Generate every target.
+
+        The time is a single image's share of all that the scene takes, compiling and loading aside.
         """
         folder = self._folder(inputs.category)
         model = _loaded(folder)
@@ -114,12 +115,13 @@ class Diffusion:
         return Synthesis(made.images, given=given)
 
     def generator(self, model: ExtrapolationModel) -> DiffusionGenerator:
-        """What paints views with this method's options."""
+        """What generates views with this method's options."""
         return DiffusionGenerator(model, self.sampler(model), references=self.references)
 
     def _warm_up(self, model: ExtrapolationModel, inputs: SceneInputs) -> None:
-        """Paint in one step: the first pictures of a process, and of each shape, wait for kernels
-        to be compiled and chosen, which would fall to whichever cell comes first.
+        """Generate in one step, so that kernels are compiled and chosen before the time is taken.
+
+        A process's first pictures, and the first of each shape, wait for that.
         """
         generator = self.generator(model)
         quick = replace(generator, sampler=replace(generator.sampler, steps=1, compat=None))
@@ -163,7 +165,7 @@ def _loaded(folder: Path) -> ExtrapolationModel:
 def _resampled(
     images: Float[Tensor, "n 3 h w"], size: tuple[int, int]
 ) -> Float[Tensor, "n 3 h2 w2"]:
-    """At the table's size: a small model paints small pictures."""
+    """At the table's size: a small model generates small pictures."""
     if images.shape[-2:] == size:
         return images.clamp(0, 1)
     resized = functional.interpolate(images, size, mode="bicubic", antialias=True)

@@ -1,4 +1,4 @@
-"""A diffusion method that paints the targets one after another, each on from those before."""
+"""A diffusion method that generates the targets in turn, from the inputs and earlier targets."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ from extrap_train.diffusion.generator import GeneratedViews, ViewGenerator
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.geometry.world_frame import WorldFrame
 from extrap_train.reconstruction.cloud import cloud_of
-from extrap_train.reconstruction.completion import Step, Workshop, complete, map_of_inputs
+from extrap_train.reconstruction.completion import CompletionPipeline, Step, complete, map_of_inputs
 from extrap_train.reconstruction.global_map import GENERATED, GlobalMap
 from extrap_train.reconstruction.inputs import first_views, fit_world_frame
 from extrap_train.reconstruction.planner import Query
@@ -24,10 +24,10 @@ from extrap_train.views import Camera, View, stack_cameras
 
 @dataclass(frozen=True)
 class IncrementalDiffusion(Diffusion):
-    """The incremental loop with the targets as its queries (paper II-C, METHOD §5).
+    """The incremental loop with the targets as its queries (paper II-C).
 
-    Every painted view is given depth, checked against the map, merged, and a reference from then
-    on; the loop chooses the order. Only the inputs' depth is given: that of the painted views is
+    Every generated view is given depth, checked against the map, merged, and a reference from then
+    on; the loop chooses the order. Only the inputs' depth is given: that of the generated views is
     stereo's, whatever source the inputs' came from.
     """
 
@@ -38,19 +38,19 @@ class IncrementalDiffusion(Diffusion):
         size = model.config.warp_size
         views, confidences = first_views(inputs.fine_views, inputs.depth_source, world, size)
         known = map_of_inputs(views, confidences, options.tolerance)
-        painter = _Remembering(self.generator(model))
-        workshop = Workshop(painter, depth_source(StereoConfig()), options, inputs.seed)
+        generator = _Remembering(self.generator(model))
+        pipeline = CompletionPipeline(generator, depth_source(StereoConfig()), options, inputs.seed)
         cameras = world.inside(inputs.targets.squared(size))
         names = target_names(inputs)
         queries = [Query(name, cameras[index]) for index, name in enumerate(names)]
         steps: list[Step] = []
-        known = complete(known, queries, workshop, lambda _, __, step: steps.append(step))
-        # Of every view the attempt that the map kept, as it was painted.
+        known = complete(known, queries, pipeline, lambda _, __, step: steps.append(step))
+        # Of every view the attempt that the map kept, as it was generated.
         seeds = {v.view.name: v.origin.seed for v in known.views if v.origin.kind == GENERATED}
         agreeing = [s for s in steps if s.agreement >= options.confidence.least_agreement]
         return Synthesis(
-            images=torch.stack([painter.pictures[name, seeds[name]] for name in names]),
-            given={"references": "inputs and painted views", "painted views' depth": "stereo"},
+            images=torch.stack([generator.pictures[name, seeds[name]] for name in names]),
+            given={"references": "inputs and generated views", "generated views' depth": "stereo"},
             points=_points(known, world, options),
             counts={
                 "pictures": float(sum(step.attempts for step in steps)),
@@ -61,7 +61,7 @@ class IncrementalDiffusion(Diffusion):
 
 @dataclass(frozen=True)
 class _Remembering:
-    """Paints as another generator does and keeps its pictures: the map holds resampled ones."""
+    """Generates as another generator does and keeps its pictures: the map holds resampled ones."""
 
     inner: ViewGenerator
     pictures: dict[tuple[str, int], Float[Tensor, "3 h w"]] = field(default_factory=dict)

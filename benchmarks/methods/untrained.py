@@ -63,7 +63,7 @@ class InpaintedWarp:
 
 
 def nearest_inputs(inputs: SceneInputs, count: int) -> list[list[int]]:
-    """For every target the up to `count` nearest inputs, nearest first (METHOD §1)."""
+    """For every target the up to `count` nearest inputs, nearest first."""
     cameras = stack_cameras([view.camera for view in inputs.views])
     order: list[list[int]] = references_by_nearness(cameras, inputs.targets)[:, :count].tolist()
     return order

@@ -91,7 +91,7 @@ def configuration(width: int) -> ModelConfig:
 
 
 def optimised(config: ModelConfig, device: torch.device) -> ExtrapolationModel:
-    """The model with random weights, none of them zero, as tasks arrange it to train and paint."""
+    """The model with random weights, none of them zero, in the layout that tasks use."""
     torch.manual_seed(0)
     model = ExtrapolationModel(config).to(device)
     torch.nn.init.normal_(model.unet.conv_out.weight, std=0.02)

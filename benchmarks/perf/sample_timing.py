@@ -31,7 +31,7 @@ def run() -> list[Row]:
 
 
 def sampling(model: ExtrapolationModel, batch: PairBatch) -> Run:
-    """The product's sampler in mixed precision, the default of every task that paints."""
+    """The product's sampler in mixed precision, the default of every task that generates."""
     device, model = batch.image.device, model.eval()
     options = SamplerConfig(steps=_STEPS[device.type], guidance=_GUIDANCE)
 

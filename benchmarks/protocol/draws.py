@@ -1,4 +1,4 @@
-"""Which frames are inputs and which are targets: drawn once, written down, hashed (METHOD §7).
+"""Which frames are inputs and which are targets: drawn once, written down, hashed.
 
 Farthest-point sampling picks a pool of nine frames; 3 or 6 of them are inputs, the rest targets.
 """

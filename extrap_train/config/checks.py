@@ -58,7 +58,7 @@ def notes(config: TrainConfig | DataPrepConfig) -> list[str]:
         return []
     return [
         f"data.image_size={size}: photographs are reduced to prep.image_size={model.warp_size} and "
-        f"views painted at model.image_size={model.image_size}; for larger views give "
+        f"views generated at model.image_size={model.image_size}; for larger views give "
         f"model.image_size={size} prep.image_size={size * model.warp_scale}"
     ]
 

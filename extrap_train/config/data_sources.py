@@ -36,7 +36,7 @@ class SyntheticConfig(DataConfig):
     frames: int = option(24, "photographs around each scene", low=2, high=10_000)
     image_size: int = option(
         128,
-        "side of the rendered photographs; views are painted at model.image_size",
+        "side of the rendered photographs; views are generated at model.image_size",
         unit="pixels",
         low=8,
         high=8192,

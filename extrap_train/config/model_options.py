@@ -122,7 +122,7 @@ class ModelConfig:
         known=FAMILIES,
     )
     image_size: int = option(
-        64, "side of the square views that are painted", unit="pixels", low=8, high=4096
+        64, "side of the square views that are generated", unit="pixels", low=8, high=4096
     )
     warp_scale: int = option(
         2,

@@ -199,7 +199,7 @@ class PreparedData:
 
     @property
     def is_corrected(self) -> bool:
-        """Whether the training pairs have been compared with the truth (METHOD §6)."""
+        """Whether the training pairs have been compared with the truth."""
         return bool(self.manifest["correction"])
 
     def partners(self, sequence: str, query: int) -> Int[np.ndarray, " m"]:

@@ -98,7 +98,7 @@ def adaptation_pairs(
 
 
 class ScenePairs(AdaptationPairs):
-    """All N(N − 1) pairs (query, nearest reference) of N posed views (METHOD section 4).
+    """All N(N − 1) pairs (query, nearest reference) of N posed views.
 
     The pair with the best score cos α·(1 − cos α), the likest to what is asked for later, is held
     out, and with it its query: a view that is trained towards says nothing about others.
@@ -136,7 +136,7 @@ class VirtualPairs(AdaptationPairs):
 
     Few inputs stand far apart: their own pairs ask for what none of the references shows, which
     teaches to invent. Later queries stand between the inputs; so do these references, whose warps
-    have the holes and the seams that are to be painted, and the truth is a photograph.
+    have the holes and the seams that are to be generated, and the truth is a photograph.
 
     Of every view one reference, in the middle of their angles, is held out. No view is: with three
     inputs, what is learnt of two says nothing of the third, and all three are to be learnt.

@@ -27,7 +27,7 @@ MOST_UNUSABLE_SHARE = 0.1
 """Of a sequence's frames, beyond which the whole sequence is not trusted; a single frame never is
 a reason while `LEAST_FRAMES` are left."""
 LEAST_FRAMES = 2
-METHOD = 2
+FRAMES_VERSION = 2
 """Raised whenever the same photographs give other frames."""
 LOG = logging.getLogger(__name__)
 
@@ -59,7 +59,7 @@ class CaptureKeys:
 
     def frames_key(self, depth: str, image_size: int) -> str:
         """A hash of what frames are made from; `depth` says by what theirs is found."""
-        made_from = [METHOD, image_size, depth, self.content, self.files]
+        made_from = [FRAMES_VERSION, image_size, depth, self.content, self.files]
         return hashlib.sha256(json.dumps(made_from).encode()).hexdigest()
 
 

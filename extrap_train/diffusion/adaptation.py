@@ -66,7 +66,7 @@ def adapt(
     """Train the adapter and leave its best weights upon the model.
 
     With virtual references the truth is learnt where they reach, and in the holes the model is held
-    to what it painted before: few photographs say what surfaces look like here, but not what lies
+    to what it generated before: few photographs say what surfaces look like here, but not what lies
     in other directions. The inputs' own pairs are learnt whole, as in the paper.
 
     Candidates are moving averages: the base is one, and single steps away from it are noisier than

@@ -1,4 +1,4 @@
-"""What the denoiser is told about the query view (METHOD section 3; paper II-B).
+"""What the denoiser is told about the query view (paper II-B).
 
 Input channels of `model.family=ours`, in order: `noisy latent | reference latent | warped-image
 latent | PE(reference) | PE(warped) | mask`, with `model.geometry` `| depth | confidence` behind

@@ -117,7 +117,7 @@ class MegaScenes:
 
 
 class Ours:
-    """The fused warp of several references with its positional encoding (METHOD section 3)."""
+    """The fused warp of several references with its positional encoding."""
 
     def channels(self, latent_channels: int, config: ModelConfig) -> int:
         """See `Family.channels`."""

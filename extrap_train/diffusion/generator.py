@@ -33,7 +33,7 @@ class GeneratedViews:
 
 @runtime_checkable
 class ViewGenerator(Protocol):
-    """Whatever can paint a scene's view from any pose; a test's oracle is one too."""
+    """Whatever can generate a scene's view from any pose; a test's oracle is one too."""
 
     @property
     def image_size(self) -> int:
@@ -52,7 +52,7 @@ class ViewGenerator(Protocol):
 
         A query's noise follows from `seed` and its name alone: the picture depends neither on the
         other queries nor on their number. Raises InputError for degenerate cameras, for views
-        without depth, and where what is painted is not finite.
+        without depth, and where what is generated is not finite.
         """
         ...
 

@@ -57,7 +57,7 @@ class BaseHashes:
 
     denoiser: str
     others: str
-    """Of the networks that tell the denoiser what to paint."""
+    """Of the networks that tell the denoiser what to generate."""
 
 
 @dataclass(frozen=True)
@@ -242,7 +242,7 @@ tags:
 # An adapter for one scene
 
 Low-rank additions to the denoiser of a view-extrapolation model, trained on photographs of one
-scene alone. It paints new views of that scene; other scenes may come out worse than without it.
+scene alone. It generates new views of that scene; other scenes may come out worse than without it.
 
 | | |
 |---|---|

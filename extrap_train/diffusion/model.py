@@ -63,7 +63,7 @@ class ExtrapolationModel(nn.Module):
     def condition(self, batch: PairBatch) -> Conditioning:
         """The batch's condition; the batch must hold its warp.
 
-        Raises InputError for views of another size: a denoiser paints nothing sensible there.
+        Raises InputError for views of another size: a denoiser generates nothing sensible there.
         """
         if (batch.camera.height, batch.camera.width) != (self.config.image_size,) * 2:
             raise InputError(
@@ -131,7 +131,7 @@ def build_unet(
 
 
 def noise_schedule(config: ModelConfig) -> DDIMScheduler:
-    """1000 steps, `scaled_linear` as in ZeroNVS (METHOD section 3).
+    """1000 steps, `scaled_linear` as in ZeroNVS.
 
     With zero terminal SNR (Lin et al. 2023) the last step is pure noise, so sampling starts where
     training ended ("trailing"); an ε-prediction carries no information there and is refused.

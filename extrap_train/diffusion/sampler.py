@@ -24,6 +24,7 @@ MultistepSolver = Any
 _MULTISTEP = {"dpmpp": DPMSolverMultistepScheduler, "unipc": UniPCMultistepScheduler}
 _FEWEST_LEADING = 50
 _PURE_NOISE = -4.0
+"""Of log α/σ: what lies below is as good as pure noise."""
 _SCHEDULE_KEYS = (
     "num_train_timesteps",
     "beta_start",
@@ -115,9 +116,9 @@ def sample_ddim(
     is not where the denoiser is evaluated next when n does not divide 1000.
     """
     prediction_type = schedule.config["prediction_type"]
-    levels = [*schedule.alphas_cumprod[timesteps].tolist(), float(schedule.final_alpha_cumprod)]
+    alphas = [*schedule.alphas_cumprod[timesteps].tolist(), float(schedule.final_alpha_cumprod)]
     x = draw_noise()
-    for timestep, (alpha, alpha_next) in zip(timesteps.tolist(), pairwise(levels), strict=True):
+    for timestep, (alpha, alpha_next) in zip(timesteps.tolist(), pairwise(alphas), strict=True):
         signal, noise = sqrt(alpha), sqrt(1 - alpha)
         prediction = denoise(x, timestep)
         if prediction_type == "epsilon":
@@ -176,10 +177,11 @@ def guide(
     scale: float,
     rescale: float,
 ) -> Float[Tensor, "b z h w"]:
-    """null + scale · (conditional − null), its spread brought back to the conditional's by a share.
+    """Classifier-free guidance, null + scale · (conditional − null), with guidance rescale.
 
-    The share `rescale` is Lin et al. 2023, equations 15 and 16: guidance widens the prediction's
-    distribution, which zero terminal SNR turns into burnt colours.
+    Guidance raises the prediction's standard deviation, which zero terminal SNR turns into burnt
+    colours. `rescale` interpolates from there (0) to the conditional's own standard deviation (1):
+    Lin et al. 2023, equations 15 and 16.
     """
     extrapolated = null + scale * (conditional - null)
     if rescale == 0:
@@ -190,38 +192,40 @@ def guide(
 
 
 def ddim_timesteps(schedule: DDIMScheduler, config: SamplerConfig) -> Int[Tensor, " n"]:
-    """DDIM's timesteps, even in time, from the noisiest down, where sampling starts.
+    """DDIM's timesteps, evenly spaced, noisiest first.
 
-    Without zero terminal SNR 50 steps, and more that divide the schedule, start a stride below it,
-    at 981 of 999, as ZeroNVS and MegaScenes were published ("leading"): fewer would start so far
-    below that the pure noise which they are given is none of theirs. With `compat` the spacing is
-    the published one whatever the number, without the noisiest step; InputError where the model is
-    none of theirs.
+    By default the first one is the schedule's noisiest, 999 ("trailing" spacing). A schedule with
+    "leading" spacing, as ZeroNVS and MegaScenes were published with, starts one stride lower: at
+    981 with 50 steps. That holds for 50 steps or more that divide the schedule evenly. With fewer
+    the stride is so long that the first timestep would no longer be close to pure noise, which is
+    what sampling starts from. `compat` forces the published spacing for any number of steps and
+    drops the noisiest one; InputError where the model is none of theirs.
     """
-    count, levels = config.steps, schedule.config["num_train_timesteps"]
-    leading = torch.arange(count - 1, -1, -1) * (levels // count) + 1
+    count, train_steps = config.steps, schedule.config["num_train_timesteps"]
+    leading = torch.arange(count - 1, -1, -1) * (train_steps // count) + 1
     if config.compat is not None:
-        kind, pure = schedule.config["prediction_type"], schedule.config["rescale_betas_zero_snr"]
-        require_published(config, kind, zero_terminal_snr=pure)
+        zero_snr = schedule.config["rescale_betas_zero_snr"]
+        require_published(config, schedule.config["prediction_type"], zero_terminal_snr=zero_snr)
         return leading[1:]
     is_leading = schedule.config["timestep_spacing"] == "leading"
-    if is_leading and _FEWEST_LEADING <= count < levels and levels % count == 0:
+    if is_leading and _FEWEST_LEADING <= count < train_steps and train_steps % count == 0:
         return leading
-    return torch.tensor([round(levels * (count - i) / count) - 1 for i in range(count)])
+    return torch.tensor([round(train_steps * (count - i) / count) - 1 for i in range(count)])
 
 
 def multistep_solver(schedule: DDIMScheduler, config: SamplerConfig) -> MultistepSolver:
     """DPM-Solver++(2M) (Lu et al. 2022) or UniPC (Zhao et al. 2023) with its `timesteps` laid out.
 
-    They step evenly in log-SNR down to no noise at all, in which their error terms are written:
-    even in time, their last step is so long that it costs the whole gain.
+    Their timesteps are spaced evenly in log-SNR, the variable that they integrate over, and the
+    last step ends at zero noise. Spaced evenly in time, the last step would be so long in log-SNR
+    that second order gains nothing.
     """
     options = {key: schedule.config[key] for key in _SCHEDULE_KEYS}
     solver: MultistepSolver = _MULTISTEP[config.solver].from_config(options)
     solver.set_timesteps(config.steps)
-    levels = even_in_log_snr(solver.alphas_cumprod, config.steps)
-    alpha = solver.alphas_cumprod[levels]
-    solver.timesteps = levels
+    timesteps = even_in_log_snr(solver.alphas_cumprod, config.steps)
+    alpha = solver.alphas_cumprod[timesteps]
+    solver.timesteps = timesteps
     solver.sigmas = torch.cat([((1 - alpha) / alpha).sqrt(), torch.zeros(1)])
     return solver
 
@@ -234,19 +238,19 @@ def sampling_timesteps(schedule: DDIMScheduler, config: SamplerConfig) -> Int[Te
 
 
 def even_in_log_snr(alphas_cumprod: Float[Tensor, " t"], count: int) -> Int[Tensor, " n"]:
-    """`count` timesteps from the noisiest down, log α/σ in equal steps, none twice.
+    """`count` different timesteps, noisiest first, about equally far apart in log α/σ.
 
-    What lies below log α/σ = −4 is as good as pure noise and takes the first step alone.
+    All that lies below `_PURE_NOISE` is covered by the first step.
     """
     log_ratio = 0.5 * torch.log(alphas_cumprod / (1 - alphas_cumprod))
     lowest = max(float(log_ratio[-1]), _PURE_NOISE)
     wanted = torch.linspace(lowest, float(log_ratio[0]), count)
-    levels = [len(alphas_cumprod) - 1]
+    timesteps = [len(alphas_cumprod) - 1]
     for place, value in enumerate(wanted[1:], 1):
         nearest = int((log_ratio - value).abs().argmin())
-        left = count - 1 - place  # every later step needs a level of its own
-        levels.append(max(left, min(nearest, levels[-1] - 1)))
-    return torch.tensor(levels)
+        left = count - 1 - place  # every later step needs a timestep of its own
+        timesteps.append(max(left, min(nearest, timesteps[-1] - 1)))
+    return torch.tensor(timesteps)
 
 
 def _repeated(timestep: int, latent: Float[Tensor, "b z h w"]) -> Int[Tensor, " b"]:
@@ -262,7 +266,7 @@ def _require_finite(
     finite = latent.isfinite().flatten(1).all(1) & images.isfinite().flatten(1).all(1)
     if not finite.all():
         raise InputError(
-            f"view {names[int(finite.int().argmin())]}: what the model painted is not finite (NaN "
-            "or infinite): its weights may have diverged in training: give other weights=, or a "
-            "smaller model.learning_rate; or numbers overflow in trainer.precision: give 32-true"
+            f"view {names[int(finite.int().argmin())]}: the generated picture is not finite (NaN "
+            "or infinite). If the weights diverged in training, give other weights= or a smaller "
+            "model.learning_rate; if numbers overflow, give trainer.precision=32-true"
         )

@@ -1,4 +1,4 @@
-"""Depth of one new view against views that are known already, in closed form (METHOD §5.4; paper
+"""Depth of one new view against views that are known already, in closed form (paper
 II-C).
 
 Every edge, a pair of point maps in a frame and a unit of its own, is placed in the world by the
@@ -70,7 +70,7 @@ class Alignment:
 
 
 def align_view(camera: Camera, edges: Edges) -> Alignment:
-    """Solve for the depth of the (unbatched) new view with everything known frozen (METHOD §5.4).
+    """Solve for the depth of the (unbatched) new view with everything known frozen.
 
     Each edge e has a similarity S_e = (s, R, t) from its frame to the world, fitted to the known
     view's points, and says the depth z_e(p) where S_e of its point is nearest to the ray of pixel

@@ -76,7 +76,7 @@ def common_center(cameras: Camera) -> Float[np.ndarray, "3"] | None:
 
 
 def pairwise_angles(cameras: Camera, center: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n n"]:
-    """Angles in [0, π] between viewing directions as seen from the scene's centre (METHOD §6)."""
+    """Angles in [0, π] between viewing directions as seen from the scene's centre."""
     directions = directions_from(cameras, center)
     angles = np.arccos(np.clip(directions @ directions.T, -1.0, 1.0))
     np.fill_diagonal(angles, 0.0)
@@ -145,7 +145,7 @@ def extra_references(
 def farthest_point_sample(
     positions: Float[np.ndarray, "n d"], count: int, start: int = 0
 ) -> Int[np.ndarray, " k"]:
-    """Indices of points, each the farthest from those before it; ties by index (METHOD §7)."""
+    """Indices of points, each the farthest from those before it; ties by index."""
     if not 1 <= count <= len(positions):
         raise ValueError(f"cannot choose {count} of {len(positions)} points")
     chosen = [start]

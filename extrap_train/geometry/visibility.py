@@ -1,7 +1,7 @@
 """Visibility through unobserved space: which part of a query's rays no reference has looked into.
 
 A warped point is known to be visible only if the ray towards it runs through space that some
-reference has *seen to be empty* (METHOD §1.5). A point of space is observed empty if a reference
+reference has *seen to be empty*. A point of space is observed empty if a reference
 has a known depth where the point projects, and the point lies in front of it by more than
 `TOLERANCE`. All other space is unobserved: it lies behind a surface, or outside every reference's
 view. It may be empty or not; a surface that is warped from behind it is a hypothesis.

@@ -1,4 +1,4 @@
-"""The incremental loop: choose, generate, align, check, merge (paper II-C; METHOD §5)."""
+"""The incremental loop: choose, generate, align, check, merge (paper II-C)."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -11,7 +11,7 @@ from extrap_train.config import CompletionConfig
 from extrap_train.depth import DepthSource
 from extrap_train.diffusion.generator import ViewGenerator
 from extrap_train.geometry.cameras import unproject
-from extrap_train.reconstruction.depth_completion.completed import DepthCompletion
+from extrap_train.reconstruction.depth_completion.inference import DepthCompletion
 from extrap_train.reconstruction.global_map import GENERATED, GIVEN, GlobalMap, MapView, Origin
 from extrap_train.reconstruction.new_view import Proposal, propose, propose_completed
 from extrap_train.reconstruction.planner import Query, next_query
@@ -21,7 +21,7 @@ from extrap_train.views import Camera, View, stack_cameras
 REFERENCES = 3
 """Views that a picture is warped from (paper II-A)."""
 LEAST_OVERLAP = 50
-"""Pixels that two fronts must share to be compared."""
+"""Pixels that two branches must share to be compared."""
 
 
 @dataclass(frozen=True)
@@ -34,21 +34,21 @@ class Step:
     edges: int
     fresh_points: int
     loop_error: float | None
-    """Median distance of what two fronts show of this view, in scene units; None if one front."""
+    """Distance between what two branches show of this view (`loop_error`), in scene units."""
     seconds: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
-class Workshop:
-    """What makes views."""
+class CompletionPipeline:
+    """The models and options that new views are made with."""
 
     generator: ViewGenerator
     source: DepthSource
-    """Of the generated views."""
+    """Measures the generated views' depth."""
     options: CompletionConfig
     seed: int
     completion: DepthCompletion | None = None
-    """Of the generated views' depth, in place of the source."""
+    """Predicts the generated views' depth, in place of `source`."""
 
 
 def map_of_inputs(
@@ -57,14 +57,14 @@ def map_of_inputs(
     """The map of the given views; each must have a depth, and they are the roots of all others."""
     known = GlobalMap(tolerance)
     for index, (view, confidence) in enumerate(zip(views, confidences, strict=True)):
-        known, _ = known.added(view, confidence, Origin(GIVEN, front=index))
+        known, _ = known.added(view, confidence, Origin(GIVEN, root=index))
     return known
 
 
 def complete(
     known: GlobalMap,
     queries: Sequence[Query],
-    workshop: Workshop,
+    pipeline: CompletionPipeline,
     on_step: Callable[[GlobalMap, MapView, Step], None],
 ) -> GlobalMap:
     """Add every query that the map does not have yet; `on_step` is called after each."""
@@ -75,28 +75,33 @@ def complete(
         query = next_query(known, left)
         planned = time.perf_counter() - started
         left = [other for other in left if other.name != query.name]
-        known, added, step = add_view(known, query, workshop)
+        known, added, step = add_view(known, query, pipeline)
         step.seconds["plan"] = planned
         on_step(known, added, step)
     return known
 
 
-def add_view(known: GlobalMap, query: Query, workshop: Workshop) -> tuple[GlobalMap, MapView, Step]:
-    """Make one view and merge it: again with another seed while it contradicts the map."""
-    options, clock = workshop.options, _Clock()
+def add_view(
+    known: GlobalMap, query: Query, pipeline: CompletionPipeline
+) -> tuple[GlobalMap, MapView, Step]:
+    """Generate one view and merge it into the map.
+
+    While it contradicts the map it is generated again with another seed; the best attempt enters.
+    """
+    options, clock = pipeline.options, _Clock()
     references = known.nearest(query.camera, REFERENCES)
     neighbours = known.nearest(query.camera, options.edges)
     tries = options.confidence.attempts if options.confidence.regenerate else 1
     best: tuple[Proposal, int] | None = None
     attempts = 0
-    for seed in range(workshop.seed, workshop.seed + tries):
-        picture = _picture(known, query, references, workshop.generator, seed)
+    for seed in range(pipeline.seed, pipeline.seed + tries):
+        picture = _picture(known, query, references, pipeline.generator, seed)
         clock.took("generate")
-        if workshop.completion is None:
-            proposal = propose(known, picture, neighbours, workshop.source, options.confidence)
+        if pipeline.completion is None:
+            proposal = propose(known, picture, neighbours, pipeline.source, options.confidence)
         else:
             proposal = propose_completed(
-                known, picture, neighbours, workshop.completion, options.confidence
+                known, picture, neighbours, pipeline.completion, options.confidence
             )
         clock.took("align")
         attempts += 1
@@ -108,7 +113,7 @@ def add_view(known: GlobalMap, query: Query, workshop: Workshop) -> tuple[Global
     proposal, seed = best
     origin = Origin(
         GENERATED,
-        front=known.views[references[0]].origin.front,
+        root=known.views[references[0]].origin.root,
         references=tuple(references),
         seed=seed,
         agreement=proposal.agreement,
@@ -129,17 +134,19 @@ def add_view(known: GlobalMap, query: Query, workshop: Workshop) -> tuple[Global
 
 
 def loop_error(known: GlobalMap, camera: Camera, neighbours: Sequence[int]) -> float | None:
-    """How far apart two fronts see the same pixels of a camera: the drift where they meet.
+    """The drift where a loop closes: how far apart two branches see the same pixels of a camera.
 
-    None where the nearest generated views are of one front, or share too few pixels.
+    A branch is all generated views whose chains of references begin at the same input. The median
+    distance, in scene units; None where the nearest generated views are of one branch, or share
+    too few pixels.
     """
-    fronts: dict[int, list[int]] = {}
+    branches: dict[int, list[int]] = {}
     for index in neighbours:
         if known.views[index].origin.kind == GENERATED:
-            fronts.setdefault(known.views[index].origin.front, []).append(index)
-    if len(fronts) < 2:
+            branches.setdefault(known.views[index].origin.root, []).append(index)
+    if len(branches) < 2:
         return None
-    one, other = (prior_of(known, camera, indices) for indices in list(fronts.values())[:2])
+    one, other = (prior_of(known, camera, indices) for indices in list(branches.values())[:2])
     both = one.mask & other.mask
     if int(both.sum()) < LEAST_OVERLAP:
         return None

@@ -23,7 +23,7 @@ class Origin:
 
     kind: str
     """`given` or `generated`."""
-    front: int
+    root: int
     """Index of the given view at the root of its chain of nearest references."""
     references: tuple[int, ...] = ()
     """Indices of the views that it was made from, nearest first."""

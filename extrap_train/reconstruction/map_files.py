@@ -37,7 +37,7 @@ class _ViewRecord:
 
     name: str
     kind: Literal["given", "generated"]
-    front: _Index
+    root: _Index
     references: list[_Index]
     seed: int
     agreement: float
@@ -82,7 +82,7 @@ def save_view(view: MapView, step: Step | None, folder: Path, index: int) -> Non
     record = _ViewRecord(
         name=view.view.name,
         kind=origin.kind,  # type: ignore[arg-type]
-        front=origin.front,
+        root=origin.root,
         references=list(origin.references),
         seed=origin.seed,
         agreement=origin.agreement,
@@ -137,7 +137,7 @@ def _read_record(folder: Path, index: int) -> _ViewRecord:
 
 def _load(folder: Path, index: int) -> MapView:
     path, record = view_file(folder, index), _read_record(folder, index)
-    if max([record.front, *record.references]) > index:
+    if max([record.root, *record.references]) > index:
         raise InputError(f"{_record_file(folder, index)}: names later views; {_REMEDY}")
     tensors = _read_tensors(path, record)
     camera = Camera(tensors["world_to_cam"], tensors["intrinsics"], record.size, record.size)
@@ -147,7 +147,7 @@ def _load(folder: Path, index: int) -> MapView:
         View(tensors["image"], camera, tensors["depth"], name=record.name),
         tensors["confidence"],
         tensors["fresh"],
-        Origin(record.kind, record.front, tuple(record.references), record.seed, record.agreement),
+        Origin(record.kind, record.root, tuple(record.references), record.seed, record.agreement),
     )
 
 

@@ -16,7 +16,7 @@ from extrap_train.geometry.cameras import unproject_to_world
 from extrap_train.geometry.ncc import ncc_consistent
 from extrap_train.reconstruction.agreement import Sight, look_up
 from extrap_train.reconstruction.continuation import continued_depth
-from extrap_train.reconstruction.depth_completion.completed import DepthCompletion
+from extrap_train.reconstruction.depth_completion.inference import DepthCompletion
 from extrap_train.reconstruction.global_map import MOST_COMPARED, GlobalMap
 from extrap_train.reconstruction.measurement import (
     Measured,

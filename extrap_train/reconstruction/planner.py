@@ -1,4 +1,4 @@
-"""Where views are made, and which one next (METHOD §5.1; paper II-B: about 30° at a time)."""
+"""Where views are made, and which one next (paper II-B: about 30° at a time)."""
 
 from dataclasses import dataclass
 
@@ -74,7 +74,7 @@ def _cameras_at(world_to_cam: Float[np.ndarray, "n 4 4"], like: Camera) -> Camer
 
 def next_query(known: GlobalMap, queries: list[Query]) -> Query:
     """The query that the map covers best, of those 20–40° from it; of equals, the one farthest
-    from the newest view, so that fronts grow by turns. The nearest one where none is in range.
+    from the newest view, so that branches grow in turn. The nearest one where none is in range.
     """
     cameras = stack_cameras([*(v.camera for v in known.views), *(q.camera for q in queries)])
     angles = pairwise_angles(cameras, scene_center(known.cameras))[len(known) :, : len(known)]
@@ -89,7 +89,7 @@ def next_query(known: GlobalMap, queries: list[Query]) -> Query:
 
 
 def expected_order(known: GlobalMap, queries: list[Query]) -> list[Query]:
-    """The queries as angles alone order them, nearest first, fronts by turns; coverage, which
+    """The queries as angles alone order them, nearest first, branches in turn; coverage, which
     nobody knows before the views are made, may change it.
     """
     cameras = stack_cameras([*(v.camera for v in known.views), *(q.camera for q in queries)])

@@ -44,7 +44,7 @@ def cloud_scores(
 
 
 def drift(steps: Sequence[Step], known: GlobalMap) -> dict[str, float | int | None]:
-    """Where fronts met: the largest of their errors, as a share of the scene's size."""
+    """Where branches met: the largest of their errors, as a share of the scene's size."""
     errors = [step.loop_error for step in steps if step.loop_error is not None]
     center = torch.from_numpy(scene_center(known.cameras)).float()
     size = scene_size(known.cameras, center)

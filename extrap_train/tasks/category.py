@@ -22,9 +22,7 @@ from extrap_train.device import (
     trainer_precision,
 )
 from extrap_train.diffusion.callbacks import AveragedWeights, MetricsTable, StepProgress
-from extrap_train.diffusion.checkpoint import initial_model, save_model
-from extrap_train.diffusion.model import ExtrapolationModel, use_channels_last
-from extrap_train.diffusion.resume import (
+from extrap_train.diffusion.checkpoints import (
     Checkpoints,
     WholeCheckpointIO,
     newest_intact,
@@ -32,6 +30,8 @@ from extrap_train.diffusion.resume import (
     step_of,
     thin_checkpoints,
 )
+from extrap_train.diffusion.model import ExtrapolationModel, use_channels_last
+from extrap_train.diffusion.model_files import initial_model, save_model
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.metrics import lpips_or_reason
 from extrap_train.processes import Opening, announce, is_first, join

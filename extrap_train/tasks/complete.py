@@ -20,7 +20,7 @@ from extrap_train.config import (
     dotted,
 )
 from extrap_train.data.photographs import CATEGORY
-from extrap_train.data.scene import SYNTHETIC_SCHEME, open_scene
+from extrap_train.data.scene_spec import SYNTHETIC_SCHEME, open_scene
 from extrap_train.data.sequences import Frame, FrameSequence
 from extrap_train.data.square_frames import too_many_unusable
 from extrap_train.data.synthetic import SyntheticScene, build_scene
@@ -28,12 +28,12 @@ from extrap_train.depth.sources import depth_source
 from extrap_train.device import advise_on_sampling_memory
 from extrap_train.errors import InputError
 from extrap_train.geometry.world_frame import WorldFrame
-from extrap_train.reconstruction.completion import Step, Workshop, complete, map_of_inputs
-from extrap_train.reconstruction.depth_completion.completed import NetworkCompletion
+from extrap_train.reconstruction.cloud_pictures import draw_plan
+from extrap_train.reconstruction.completion import CompletionPipeline, Step, complete, map_of_inputs
+from extrap_train.reconstruction.depth_completion.inference import NetworkCompletion
 from extrap_train.reconstruction.depth_completion.network import load_depth_network
 from extrap_train.reconstruction.exact import ExactDepth, ExactGenerator
 from extrap_train.reconstruction.global_map import GlobalMap, MapView
-from extrap_train.reconstruction.growth import draw_plan
 from extrap_train.reconstruction.inputs import (
     check_cameras,
     choose_frames,
@@ -55,7 +55,7 @@ from extrap_train.reconstruction.viewer import CloudViewer
 from extrap_train.store import Outcome
 from extrap_train.store.digests import file_digest
 from extrap_train.store.manifest import claim
-from extrap_train.tasks.completed import Completed, write_completed
+from extrap_train.tasks.completion_results import Completed, write_completed
 from extrap_train.tasks.scene_inputs import (
     require_space,
     required_scene,
@@ -151,7 +151,7 @@ def _job(config: TrainConfig) -> _Job:
     check_cameras(cameras, [sequence.frames[i].name for i in inputs])
     _check_category(config, sequence)
     folder = result_folder(config, f"{sequence.category}_{sequence.name}")
-    used = UsedWeights.of(config) if _is_painted(config) else None
+    used = UsedWeights.of(config) if _is_generated(config) else None
     return _Job(
         config, sequence, truth, folder, inputs, fit_world_frame(stack_poses(cameras)), used
     )
@@ -180,13 +180,13 @@ def _readable(config: TrainConfig, sequence: FrameSequence, inputs: list[int]) -
 
 
 def _check_category(config: TrainConfig, sequence: FrameSequence) -> None:
-    """A category's newest model is not to paint another category unasked."""
+    """A model does not generate views of another category unasked."""
     own, chosen = sequence.category, config.category.name
     if own in (CATEGORY, chosen):
         return
     if config.weights is None and config.complete.generator == "model":
         raise InputError(
-            f"scene {config.scene!r} is of category {own}, but category={chosen} would paint it "
+            f"scene {config.scene!r} is of category {own}, but category={chosen} would generate it "
             f"with its newest model: give category={own}, or name the model, weights=FOLDER or base"
         )
     terminal().print(f"the scene is of category {own}, not {chosen}")
@@ -194,8 +194,8 @@ def _check_category(config: TrainConfig, sequence: FrameSequence) -> None:
 
 def _run(job: _Job, console: Console) -> bool:
     """Whether every view was there already."""
-    workshop = _workshop(job)
-    known = _started_map(job, workshop, console)
+    pipeline = _pipeline(job)
+    known = _started_map(job, pipeline, console)
     queries = _queries(job, known)
     # The same plan for a run that resumes.
     start = replace(known, views=known.views[: len(job.inputs)])
@@ -206,17 +206,17 @@ def _run(job: _Job, console: Console) -> bool:
         console.print(f"plan: {job.folder / 'plan.png'}; nothing was generated")
         return False
     missing = _count_missing(known, queries)
-    require_space(job.folder, missing * view_bytes(workshop.generator.warp_size))
+    require_space(job.folder, missing * view_bytes(pipeline.generator.warp_size))
     with _viewer(job, known, console) as viewer:
         with advise_on_sampling_memory(1, job.config.trainer):
-            known = _completed(job, known, queries, workshop, viewer)
+            known = _completed(job, known, queries, pipeline, viewer)
         steps = load_steps(job.folder / "map", len(known))
         seconds = {
             "inputs": load_input_seconds(job.folder / "map"),
             "views": sum(sum(step.seconds.values()) for step in steps),
         }
         done = Completed(known, steps, job.world, job.truth, seconds)
-        write_completed(done, job.config, job.sequence, workshop, job.used, job.folder, console)
+        write_completed(done, job.config, job.sequence, pipeline, job.used, job.folder, console)
     return not missing
 
 
@@ -226,12 +226,12 @@ def _count_missing(known: GlobalMap, queries: Sequence[Query]) -> int:
     return sum(query.name not in there for query in queries)
 
 
-def _workshop(job: _Job) -> Workshop:
+def _pipeline(job: _Job) -> CompletionPipeline:
     config = job.config
     if config.complete.generator == "exact":
         assert job.truth is not None
         scene = job.truth
-        return Workshop(
+        return CompletionPipeline(
             ExactGenerator(scene, config.complete.exact_size, job.world),
             ExactDepth(scene, job.world),
             config.complete,
@@ -244,10 +244,12 @@ def _workshop(job: _Job) -> Workshop:
     completion = None
     if job.depth_network is not None:
         completion = NetworkCompletion(load_depth_network(job.depth_network))
-    return Workshop(generator, depth_source(source), config.complete, config.seed, completion)
+    return CompletionPipeline(
+        generator, depth_source(source), config.complete, config.seed, completion
+    )
 
 
-def _started_map(job: _Job, workshop: Workshop, console: Console) -> GlobalMap:
+def _started_map(job: _Job, pipeline: CompletionPipeline, console: Console) -> GlobalMap:
     """What an earlier run left, or the inputs, measured and saved."""
     folder = job.folder / "map"
     known = load_map(folder, job.config.complete.tolerance)
@@ -255,7 +257,7 @@ def _started_map(job: _Job, workshop: Workshop, console: Console) -> GlobalMap:
         console.print(f"{folder}: {len(known)} views were made before and are used again")
         return known
     started = time.perf_counter()
-    size = workshop.generator.warp_size
+    size = pipeline.generator.warp_size
     require_space(job.folder, len(job.inputs) * view_bytes(size))
     source = depth_source(job.config.depth)
     brought = source.image_size is None
@@ -276,10 +278,10 @@ def _map_options(config: TrainConfig) -> dict[str, Any]:
         for key, value in dotted(asdict(config.complete)).items()
         if not f"{key}.".startswith(tuple(f"{name}." for name in _NOT_PART_OF_THE_MAP))
     }
-    return complete_options | (model_options(config) if _is_painted(config) else {})
+    return complete_options | (model_options(config) if _is_generated(config) else {})
 
 
-def _is_painted(config: TrainConfig) -> bool:
+def _is_generated(config: TrainConfig) -> bool:
     return config.complete.generator != "exact"
 
 
@@ -321,7 +323,7 @@ def _completed(
     job: _Job,
     known: GlobalMap,
     queries: list[Query],
-    workshop: Workshop,
+    pipeline: CompletionPipeline,
     viewer: CloudViewer | None,
 ) -> GlobalMap:
     folder = job.folder / "map"
@@ -334,4 +336,4 @@ def _completed(
                 viewer.show(grown)
             bar.advance()
 
-        return complete(known, queries, workshop, on_step)
+        return complete(known, queries, pipeline, on_step)

@@ -1,4 +1,4 @@
-"""`task=depth`: train the network that gives painted views their depth."""
+"""`task=depth`: train the network that gives generated views their depth."""
 
 from collections.abc import Iterable
 from dataclasses import asdict
@@ -16,7 +16,7 @@ from extrap_train.errors import InputError
 from extrap_train.reconstruction.depth_completion.calibration import DepthScores, calibrate
 from extrap_train.reconstruction.depth_completion.examples import draw_examples
 from extrap_train.reconstruction.depth_completion.network import save_depth_network
-from extrap_train.reconstruction.depth_completion.training import (
+from extrap_train.reconstruction.depth_completion.network_training import (
     DepthTraining,
     StoredExamples,
     save_examples,
@@ -87,22 +87,22 @@ def _stored(config: TrainConfig, folder: Path, indices: Iterable[int]) -> Stored
 def _draw_missing(
     config: TrainConfig, data: SyntheticConfig, folder: Path, indices: list[int]
 ) -> None:
-    """Draw the examples of every capture that has no file yet, with the packaged painters."""
+    """Draw the examples of every capture that has no file yet, with the packaged generators."""
     wanted = [(member, index) for index in indices for member in config.category.members]
     missing = [pair for pair in wanted if not _example_file(folder, *pair).is_file()]
-    painters = {member: _painter(member) for member in {member for member, _ in missing}}
+    generators = {member: _generator(member) for member in {member for member, _ in missing}}
     with progress("drawing examples", len(missing), "captures") as bar:
         for category, index in missing:
             scene, walk = build_scene(category, index, data.seed), (category, index, data.seed)
             cameras = handheld_orbit(scene, data.frames, data.image_size, walk_seed(*walk))
             views = [render(scene, cameras[i], supersample=1) for i in range(data.frames)]
             rng = np.random.default_rng((config.seed, walk_seed(*walk)))
-            examples = draw_examples(views, painters[category], EXAMPLES_PER_CAPTURE, rng)
+            examples = draw_examples(views, generators[category], EXAMPLES_PER_CAPTURE, rng)
             save_examples(examples, _example_file(folder, category, index))
             bar.advance()
 
 
-def _painter(category: str) -> DiffusionGenerator:
+def _generator(category: str) -> DiffusionGenerator:
     model = open_model(packaged_name("ours", category))
     return DiffusionGenerator(model, model.config.sampler)
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import torch
 
 from extrap_train.config import TrainConfig
-from extrap_train.diffusion.checkpoint import load_model, save_compact
 from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.model_files import load_model, save_compact
 from extrap_train.diffusion.packaged import packaged_name, packaged_weights
 from extrap_train.runs import existing_run
 from extrap_train.store import Outcome

@@ -11,8 +11,8 @@ from rich.console import Console
 
 from extrap_train.config import TrainConfig, dotted, sampler_for
 from extrap_train.data.pair_examples import linspace_indices
-from extrap_train.data.scene import scene_address
 from extrap_train.data.scene_pairs import AdaptationPairs, adaptation_pairs
+from extrap_train.data.scene_spec import scene_address
 from extrap_train.data.scene_views import target_views
 from extrap_train.data.sequences import Frame, FrameSequence
 from extrap_train.device import advise_on_adapting_memory, trainer_precision
@@ -251,7 +251,7 @@ def _write(
     steps, losses = [list(column) for column in zip(*done.losses, strict=True)]
     curve(steps, {"held-out pair": losses}, "denoising error", folder / "curve.png")
     summary = {
-        "painted_with": asdict(used),
+        "generated_with": asdict(used),
         "inputs": read[0],
         "held_out_frames": read[1],
         "pairs": pairs.counts(),

@@ -11,7 +11,7 @@ from typing import Any
 
 from extrap_train.config import SyntheticConfig, TrainConfig, dotted
 from extrap_train.data.photographs import CATEGORY
-from extrap_train.data.scene import SYNTHETIC_SCHEME, open_scene, scene_address
+from extrap_train.data.scene_spec import SYNTHETIC_SCHEME, open_scene, scene_address
 from extrap_train.data.scene_views import input_views, select_input_frames
 from extrap_train.data.sequences import Frame, FrameSequence
 from extrap_train.depth.sources import depth_source, weight_files
@@ -119,7 +119,7 @@ def scene_manifest(
 ) -> Manifest:
     """What a task's result about a scene is made from.
 
-    `frames` are those that it reads, `weights` digests of what paints it, `options` the task's own.
+    `frames` are those that it reads, `weights` digests of the model, `options` the task's own.
     """
     scene = required_scene(config)
     made = isinstance(config.data, SyntheticConfig) and scene.startswith(SYNTHETIC_SCHEME)

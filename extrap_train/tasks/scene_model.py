@@ -1,4 +1,4 @@
-"""The model that a task about one scene paints with: weights, adapter and generator."""
+"""The model that a task about one scene generates with: weights, adapter and generator."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
@@ -10,13 +10,13 @@ from hydra.core.hydra_config import HydraConfig
 from lightning.fabric import Fabric
 
 from extrap_train.config import ModelConfig, TrainConfig, dotted, sampler_for
-from extrap_train.data.scene import scene_address
+from extrap_train.data.scene_spec import scene_address
 from extrap_train.data.sequences import Frame
 from extrap_train.device import advise_on_sampling_memory, require_accelerator
-from extrap_train.diffusion.checkpoint import is_own, load_model, published_model, saved_config
 from extrap_train.diffusion.generator import DiffusionGenerator, GeneratedViews
 from extrap_train.diffusion.lora import load_adapter, read_adapter_record
 from extrap_train.diffusion.model import ExtrapolationModel, use_channels_last
+from extrap_train.diffusion.model_files import is_own, load_model, published_model, saved_config
 from extrap_train.diffusion.packaged import (
     packaged_name,
     packaged_names,
@@ -36,7 +36,7 @@ _OF_TRAINING = ("name", "start", "learning_rate", "projection_rate", "weight_dec
 
 @dataclass(frozen=True)
 class UsedWeights:
-    """Which weights a result was painted with."""
+    """Which weights a result was generated with."""
 
     name: str
     """A packaged model's, or an absolute path."""
@@ -123,7 +123,7 @@ def _warn_of_another_scene(config: TrainConfig) -> None:
     if origin.scene != here:
         terminal(stderr=True).print(
             f"adapter={config.adapter}: was made for {origin.scene}, not for {here}; the model "
-            "without it may paint this scene better"
+            "without it may do better on this scene"
         )
 
 

@@ -7,7 +7,7 @@ from extrap_train.config import TrainConfig
 from extrap_train.data.module import PairModule
 from extrap_train.data.pair_examples import ExampleReader
 from extrap_train.data.prepared import PreparedData
-from extrap_train.diffusion.checkpoint import is_own, saved_config
+from extrap_train.diffusion.model_files import is_own, saved_config
 from extrap_train.diffusion.packaged import packaged_names, packaged_weights
 from extrap_train.errors import InputError
 from extrap_train.store.manifest import MANIFEST, Manifest, read_manifest

@@ -8,8 +8,8 @@ from dataclasses import asdict, replace
 from extrap_train.config import TrainConfig, dotted, sampler_for
 from extrap_train.data.prepared import PreparedData
 from extrap_train.device import require_accelerator
-from extrap_train.diffusion.checkpoint import load_model, saved_config
 from extrap_train.diffusion.model import use_channels_last
+from extrap_train.diffusion.model_files import load_model, saved_config
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.metrics import lpips_or_reason
 from extrap_train.runs import Finished, RunFolder, existing_run, trained_on

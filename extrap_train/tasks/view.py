@@ -69,7 +69,7 @@ class _Query:
 class _Summary:
     """`summary.json` of a view: what it shows, and from what it was made."""
 
-    painted_with: UsedWeights
+    generated_with: UsedWeights
     photographs: dict[str, str]
     """SHA-256 of the content of the inputs, by the frames' names."""
     shown: dict[str, float]
@@ -79,7 +79,7 @@ class _Summary:
 
 
 def run(config: TrainConfig) -> None:
-    """Paint the views that `pose` or `orbit` ask for, and leave them as PNG, GIF and MP4.
+    """Generate the views that `pose` or `orbit` ask for, and leave them as PNG, GIF and MP4.
 
     They replace what was asked of the same scene, inputs and weights before.
     """
@@ -98,7 +98,7 @@ def run(config: TrainConfig) -> None:
         cameras, truth = _cameras(query, inputs.views, config, size)
         generator = scene_generator(config, model)
         made = generate_views(generator, inputs.views, cameras, query.names, config)
-        console.print(f"painted with {used} at {size} x {size} pixels, which the weights fix")
+        console.print(f"generated with {used} at {size} x {size} pixels, which the weights fix")
         _print_shares(made, query.names, console)
         score, why_not = _compare(made, truth, inputs, config, sequence)
         with result.replace() as whole:
@@ -180,7 +180,7 @@ def _as_named(pose: str | None, sequence: FrameSequence) -> str | None:
 
 
 def _query(config: TrainConfig, sequence: FrameSequence) -> _Query:
-    """InputError where nothing can be painted of what is asked for."""
+    """InputError where nothing can be generated of what is asked for."""
     if (config.pose is None) == (config.orbit is None):
         raise InputError("task=view needs a pose=FRAME|FILE.json or an orbit=DEGREES, one of both")
     if config.pose is None:
@@ -200,7 +200,7 @@ def _query(config: TrainConfig, sequence: FrameSequence) -> _Query:
 def _cameras(
     query: _Query, views: list[View], config: TrainConfig, size: int
 ) -> tuple[Camera, View | None]:
-    """The cameras to paint, and the photograph at the pictures' size where there is one."""
+    """The cameras to generate, and the photograph at the pictures' size where there is one."""
     if query.photograph is not None:
         square = object_square(query.photograph, size)
         truth = replace(square, name=query.names[0])

@@ -18,7 +18,7 @@ from benchmarks.methods.base import Stopwatch, Synthesis, Unavailable
 
 @dataclass(frozen=True)
 class Grey:
-    """Paints every target in one grey."""
+    """Generates every target in one grey."""
 
     level: float = 0.5
     trouble: str = ""

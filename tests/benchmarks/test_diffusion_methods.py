@@ -24,9 +24,9 @@ from benchmarks.run.plan import TableFolder
 from benchmarks.run.run_method import build_method
 from benchmarks.run_table import RunOptions, run_table
 from extrap_train.config import ModelConfig, UNetConfig
-from extrap_train.diffusion.checkpoint import save_model
 from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.model_files import save_model
 from extrap_train.errors import InputError
 from extrap_train.jobs.local import LocalLauncher
 from extrap_train.views import View
@@ -65,7 +65,7 @@ def _own_models() -> Iterator[None]:
 
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, list[View], Tensor]]:
-    """Every target in the order in which it is painted, the views it is given, and its picture;
+    """Every target in the order in which it is generated, the views it is given, and its picture;
     not what only warms the machine up.
     """
     monkeypatch.setattr(Diffusion, "_warm_up", lambda *_: None)
@@ -103,7 +103,7 @@ def test_its_weight_files_are_also_those_that_a_link_leads_to(tmp_path: Path) ->
 
 
 @each_variant
-def test_it_paints_the_targets_and_repeats_itself(name: str, weights: str) -> None:
+def test_it_generates_the_targets_and_repeats_itself(name: str, weights: str) -> None:
     inputs, truth = scene_inputs(size=40)  # other than the model's: it is resampled
     method = replace(VARIANTS[name], weights=weights)
     assert isinstance(method, Method)
@@ -136,7 +136,7 @@ def test_one_reference_is_the_nearest_input(weights: str) -> None:
 
 
 def test_an_adapter_is_its_scenes_alone(weights: str) -> None:
-    """What was painted before it changes neither the model nor what another scene is adapted to."""
+    """An earlier scene changes neither the model nor what another scene is adapted to."""
     one, _ = scene_inputs((0.0, 40.0, 80.0))
     other, _ = scene_inputs((100.0, 130.0, 150.0), (110.0, 140.0))
     method = AdaptedDiffusion(weights=weights, lora_steps=STEPS)
@@ -196,17 +196,17 @@ def test_what_a_process_does_once_is_not_a_cells_time(
     assert len(calls) == 2
 
 
-def test_what_is_painted_is_a_reference_for_the_next(
+def test_what_is_generated_is_a_reference_for_the_next(
     weights: str, asked: list[tuple[str, list[View], Tensor]]
 ) -> None:
-    """The nearer target comes first; beside the inputs, only what was painted is ever seen."""
+    """The nearer target comes first; beside the inputs, only what was generated is ever seen."""
     inputs, _ = scene_inputs((0.0, 20.0, 40.0), (95.0, 65.0))
     made = IncrementalDiffusion(weights=weights).synthesize(inputs)
     order = list(dict.fromkeys(name for name, _, _ in asked))
     assert order == ["target 1", "target 0"]
     assert made.counts["pictures"] == len(asked)
     photographs = {view.name: view.image for view in inputs.fine_views}
-    painted: list[Tensor] = []
+    generated: list[Tensor] = []
     for name, references, picture in asked:
         for view in references:
             if view.name in photographs:
@@ -214,11 +214,11 @@ def test_what_is_painted_is_a_reference_for_the_next(
                 assert error <= 0.5 / 255 + 1e-6
                 continue
             assert (name, view.name) == ("target 0", "target 1")
-            assert any(torch.equal(view.image, before) for before in painted)
+            assert any(torch.equal(view.image, before) for before in generated)
         if name == "target 1":
             assert {view.name for view in references} == set(photographs)
             larger = functional.interpolate(picture[None], (64, 64), mode="bicubic")[0]
-            painted.append((larger.clamp(0, 1) * 255).round() / 255)
+            generated.append((larger.clamp(0, 1) * 255).round() / 255)
     assert asked[-1][1][0].name == "target 1"
     for index, image in enumerate(made.images):
         assert any(torch.equal(image, i) for name, _, i in asked if name == f"target {index}")

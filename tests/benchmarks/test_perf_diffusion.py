@@ -66,7 +66,7 @@ def test_both_steps_have_one_loss(model: ExtrapolationModel, batch: PairBatch) -
     torch.testing.assert_close(ours, theirs, atol=0.02, rtol=0.02)
 
 
-def test_both_samplers_paint_one_picture(model: ExtrapolationModel, batch: PairBatch) -> None:
+def test_both_samplers_generate_one_picture(model: ExtrapolationModel, batch: PairBatch) -> None:
     theirs = plain_sampling(plain(model), batch)()
     ours = sampling(model, batch)()
     assert float((ours - theirs).abs().mean()) < 0.02

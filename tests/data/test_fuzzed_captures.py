@@ -22,7 +22,7 @@ from test_transforms_json import write_transforms
 
 from extrap_train.data.co3d import read_category
 from extrap_train.data.co3d.set_lists import read_sequence_split
-from extrap_train.data.scene import open_scene
+from extrap_train.data.scene_spec import open_scene
 from extrap_train.data.transforms_json import read_cameras
 from extrap_train.errors import InputError
 

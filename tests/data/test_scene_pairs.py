@@ -93,7 +93,7 @@ def test_views_that_look_past_each_other_turn_about_what_they_see_themselves() -
         torch.testing.assert_close(pixel[:2] / pixel[2], torch.tensor([32.0, 32.0]))
 
 
-def test_virtual_pairs_paint_every_photograph_but_from_no_reference_that_is_held_out() -> None:
+def test_virtual_pairs_generate_every_photograph_but_from_no_reference_that_is_held_out() -> None:
     views = _around([0.0, 40.0, 60.0, 100.0])
     pairs = VirtualPairs(views, 3, 4, seed=0)
     assert pairs.counts() == {"all": 16, "trained": 12}

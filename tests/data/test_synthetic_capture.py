@@ -6,7 +6,7 @@ import torch
 from data_prep.synthesize import synthesize
 from extrap_train.config import SyntheticConfig
 from extrap_train.data.co3d import read_category
-from extrap_train.data.scene import open_scene
+from extrap_train.data.scene_spec import open_scene
 from extrap_train.errors import InputError
 from extrap_train.jobs.local import LocalLauncher
 

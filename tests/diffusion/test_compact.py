@@ -12,14 +12,14 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from extrap_train.config import ModelConfig
-from extrap_train.diffusion import checkpoint
-from extrap_train.diffusion.checkpoint import (
+from extrap_train.diffusion import model_files
+from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.model_files import (
     initial_model,
     load_model,
     save_compact,
     save_model,
 )
-from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.packaged import dequantised, quantised
 from extrap_train.errors import InputError
 
@@ -34,7 +34,7 @@ def base(config: ModelConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         assert name == "base"
         return tmp_path / name
 
-    monkeypatch.setattr(checkpoint, "packaged_weights", packaged)
+    monkeypatch.setattr(model_files, "packaged_weights", packaged)
     return tmp_path / "base"
 
 

@@ -1,6 +1,4 @@
-"""The condition's channels are METHOD section 3's, in its order, and its null is one and the same
-everywhere.
-"""
+"""The condition's channels stand in their documented order, and its null is the same everywhere."""
 
 from dataclasses import replace
 

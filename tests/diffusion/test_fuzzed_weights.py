@@ -29,9 +29,9 @@ from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, D
 from extrap_train.config import AlikedMatcherConfig, LoftrMatcherConfig, LoraConfig, ModelConfig
 from extrap_train.depth.depth_anything import read_depth_anything
 from extrap_train.depth.mast3r.mast3r_checkpoint import read_network
-from extrap_train.diffusion.checkpoint import initial_model, load_model, save_model
 from extrap_train.diffusion.lora import AdapterOrigin, add_adapter, load_adapter, save_adapter
 from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.model_files import initial_model, load_model, save_model
 from extrap_train.errors import InputError
 from extrap_train.matching.aliked import read_aliked
 from extrap_train.matching.loftr import read_loftr

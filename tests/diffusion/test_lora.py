@@ -1,4 +1,4 @@
-"""An adapter changes what a model paints and never the model; it comes back as it was saved."""
+"""An adapter changes what a model generates and never the model; it comes back as it was saved."""
 
 import json
 from dataclasses import replace
@@ -45,7 +45,7 @@ def _model(config: ModelConfig) -> ExtrapolationModel:
     return model
 
 
-def _painted(model: ExtrapolationModel, batch: PairBatch) -> Tensor:
+def _generated(model: ExtrapolationModel, batch: PairBatch) -> Tensor:
     return sample_views(model, batch, SamplerConfig(), "abc")
 
 
@@ -62,9 +62,9 @@ def test_a_new_adapter_has_no_effect_and_only_it_learns(
     config: ModelConfig, batch: PairBatch
 ) -> None:
     model = _model(config)
-    before = _painted(model, batch)
+    before = _generated(model, batch)
     add_adapter(model, OPTIONS, seed=0)
-    torch.testing.assert_close(_painted(model, batch), before)
+    torch.testing.assert_close(_generated(model, batch), before)
     learning = {n for n, p in model.named_parameters() if p.requires_grad}
     assert learning
     assert all(".lora_" in name for name in learning)
@@ -77,9 +77,9 @@ def test_it_comes_back_as_it_was_saved_and_goes_without_a_trace(
 ) -> None:
     model = _model(config)
     state = {name: value.clone() for name, value in model.state_dict().items()}
-    before = _painted(model, batch)
+    before = _generated(model, batch)
     adapter = _randomised(model)
-    adapted = _painted(model, batch)
+    adapted = _generated(model, batch)
     assert (adapted - before).abs().max() > 1e-3
     save_adapter(model, adapter, tmp_path / "adapter", ORIGIN)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["adapter"]
@@ -87,16 +87,16 @@ def test_it_comes_back_as_it_was_saved_and_goes_without_a_trace(
     assert all(torch.equal(state[name], value) for name, value in model.state_dict().items())
     fresh = _model(config)
     load_adapter(fresh, tmp_path / "adapter")
-    torch.testing.assert_close(_painted(fresh, batch), adapted)
+    torch.testing.assert_close(_generated(fresh, batch), adapted)
 
 
 def test_plain_peft_reads_the_folder(config: ModelConfig, batch: PairBatch, tmp_path: Path) -> None:
     model = _model(config)
     save_adapter(model, _randomised(model), tmp_path / "adapter", ORIGIN)
-    adapted = _painted(model, batch)
+    adapted = _generated(model, batch)
     fresh = _model(config)
     peft.PeftModel.from_pretrained(fresh.unet, str(tmp_path / "adapter"))
-    torch.testing.assert_close(_painted(fresh, batch), adapted)
+    torch.testing.assert_close(_generated(fresh, batch), adapted)
 
 
 def test_other_weights_and_other_folders_are_refused(config: ModelConfig, tmp_path: Path) -> None:

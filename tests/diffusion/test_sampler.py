@@ -95,9 +95,7 @@ def test_guidance_of_one_is_the_conditional_prediction(
 
 
 def test_an_untrained_model_returns_the_filled_warp(config: ModelConfig, batch: PairBatch) -> None:
-    """Its last layer is zero and it denoises a residual: at v = 0 the mean of what it paints is its
-    base.
-    """
+    """Its last layer is zero and it denoises a residual: at v = 0 the mean result is its base."""
     model = ExtrapolationModel(replace(config, prediction="sample")).eval()
     image = sample_views(model, batch, SamplerConfig(steps=5), "abc")
     assert batch.warp is not None

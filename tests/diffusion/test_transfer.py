@@ -9,9 +9,9 @@ import torch
 from batches import batch_of
 
 from extrap_train.config import ModelConfig
-from extrap_train.diffusion.checkpoint import initial_model, save_model
 from extrap_train.diffusion.encoders import PixelPatches
 from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.model_files import initial_model, save_model
 from extrap_train.diffusion.pose_encoding import depth_scale, megascenes_pose, zeronvs_pose
 from extrap_train.diffusion.transfer import narrowed, turned_pose
 from extrap_train.errors import InputError

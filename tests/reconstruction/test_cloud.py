@@ -18,7 +18,7 @@ def _depths_seen(step: float, subdivide: int) -> torch.Tensor:
     depth = torch.full((_SIZE, _SIZE), 2.0)
     depth[:, _SIZE // 2 :] = 2 + step
     view = View(torch.rand(3, _SIZE, _SIZE), camera, depth)
-    known, _ = GlobalMap(0.01).added(view, torch.ones_like(depth), Origin(GIVEN, front=0))
+    known, _ = GlobalMap(0.01).added(view, torch.ones_like(depth), Origin(GIVEN, root=0))
     return project(cloud_of(known, subdivide=subdivide).points, camera)[1]
 
 

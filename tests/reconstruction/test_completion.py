@@ -16,7 +16,7 @@ from extrap_train.errors import InputError
 from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
 from extrap_train.geometry.warp import compute_warp
 from extrap_train.reconstruction.cloud import cloud_of
-from extrap_train.reconstruction.completion import Workshop, complete, map_of_inputs
+from extrap_train.reconstruction.completion import CompletionPipeline, complete, map_of_inputs
 from extrap_train.reconstruction.global_map import GENERATED, GlobalMap
 from extrap_train.reconstruction.map_files import load_map, save_view
 from extrap_train.reconstruction.measurement import Measured, supported
@@ -110,10 +110,10 @@ def inputs(*azimuths_deg: float) -> GlobalMap:
 def completed(known: GlobalMap, generator=None, **confidence):
     options = CompletionConfig(confidence=ConfidenceConfig(**confidence))
     steps = []
-    workshop = Workshop(generator or TracedGenerator(), TracedDepth(), options, 0)
+    pipeline = CompletionPipeline(generator or TracedGenerator(), TracedDepth(), options, 0)
     # Queries are planned from the inputs alone, wherever a run was cut.
     queries = orbit_queries(known.cameras[:3], np.radians(30))
-    grown = complete(known, queries, workshop, lambda m, v, step: steps.append(step))
+    grown = complete(known, queries, pipeline, lambda m, v, step: steps.append(step))
     return grown, steps
 
 
@@ -153,10 +153,10 @@ def test_a_turn_fills_what_the_inputs_leave_open(whole):
     assert all(step.edges >= 3 and step.attempts == 1 for step in steps)
 
 
-def test_two_fronts_meet_and_hardly_disagree(whole):
+def test_two_branches_meet_and_hardly_disagree(whole):
     known, steps = whole
-    fronts = {view.origin.front for view in known.views if view.origin.kind == GENERATED}
-    assert fronts == {0, 2}
+    roots = {view.origin.root for view in known.views if view.origin.kind == GENERATED}
+    assert roots == {0, 2}
     errors = [step.loop_error for step in steps if step.loop_error is not None]
     assert errors
     assert max(errors) < 0.02 * 1.2
@@ -278,7 +278,7 @@ def test_dataset_depth_needs_a_depth():
     known = inputs(-30.0, 0.0, 30.0)
     options = CompletionConfig()
     queries = orbit_queries(known.cameras, np.radians(30))[:1]
-    workshop = Workshop(TracedGenerator(), DatasetDepth(), options, 0)
-    grown = complete(known, queries, workshop, lambda m, v, step: None)
+    pipeline = CompletionPipeline(TracedGenerator(), DatasetDepth(), options, 0)
+    grown = complete(known, queries, pipeline, lambda m, v, step: None)
     assert (grown.views[-1].confidence <= 1).all()
     assert grown.views[-1].origin.kind == GENERATED

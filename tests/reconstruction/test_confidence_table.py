@@ -13,12 +13,12 @@ from torch import Tensor
 from torchvision.transforms.functional import gaussian_blur
 
 from extrap_train.config import CompletionConfig, ConfidenceConfig
-from extrap_train.data.scene import open_scene
+from extrap_train.data.scene_spec import open_scene
 from extrap_train.data.synthetic import build_scene
 from extrap_train.depth import DepthMap, PointMaps, point_maps_of
 from extrap_train.diffusion.generator import GeneratedViews
 from extrap_train.reconstruction.cloud import cloud_of
-from extrap_train.reconstruction.completion import Workshop, complete, map_of_inputs
+from extrap_train.reconstruction.completion import CompletionPipeline, complete, map_of_inputs
 from extrap_train.reconstruction.exact import ExactDepth, ExactGenerator
 from extrap_train.reconstruction.inputs import choose_frames, first_views, fit_world_frame
 from extrap_train.reconstruction.planner import orbit_queries
@@ -108,13 +108,13 @@ def _accuracy(spoil: Spoil, stubborn: bool, handling: ConfidenceConfig) -> dict[
     known = map_of_inputs(views, confidences, options.tolerance)
     queries = orbit_queries(known.cameras, np.radians(30))
     names = [query.name for query in queries[2::5]]
-    workshop = Workshop(
+    pipeline = CompletionPipeline(
         _SpoiledGenerator(exact, names, spoil, stubborn),
         _DepthOfThePicture(measured, exact, names, spoil),
         options,
         0,
     )
-    grown = complete(known, queries, workshop, lambda *_: None)
+    grown = complete(known, queries, pipeline, lambda *_: None)
     cloud = cloud_of(grown, votes=handling.votes)
     cloud = cloud[cloud.confidence >= handling.least_confidence]
     return cloud_scores({"": cloud}, scene, world)[""]

@@ -1,4 +1,4 @@
-"""The depth of a painted view, on a sphere over a plane: its back is known in closed form."""
+"""The depth of a generated view, on a sphere over a plane: its back is known in closed form."""
 
 from dataclasses import dataclass, replace
 
@@ -11,14 +11,14 @@ from extrap_train.config import CompletionConfig, TrainerConfig
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError
 from extrap_train.geometry.visibility import Ball
-from extrap_train.reconstruction.completion import Workshop, add_view, map_of_inputs
+from extrap_train.reconstruction.completion import CompletionPipeline, add_view, map_of_inputs
 from extrap_train.reconstruction.depth_completion.calibration import calibrate
-from extrap_train.reconstruction.depth_completion.completed import (
+from extrap_train.reconstruction.depth_completion.examples import draw_examples, with_truth
+from extrap_train.reconstruction.depth_completion.inference import (
     CompletedDepth,
     NetworkCompletion,
     fit_to_known,
 )
-from extrap_train.reconstruction.depth_completion.examples import draw_examples, with_truth
 from extrap_train.reconstruction.depth_completion.network import (
     CONFIDENT_WITHIN,
     DepthMixture,
@@ -26,18 +26,18 @@ from extrap_train.reconstruction.depth_completion.network import (
     load_depth_network,
     save_depth_network,
 )
+from extrap_train.reconstruction.depth_completion.network_training import (
+    DepthTraining,
+    StoredExamples,
+    loss_of,
+    save_examples,
+)
 from extrap_train.reconstruction.depth_completion.observation import (
     CERTAIN,
     CHANNELS,
     ENTRY,
     PRIOR,
     observe,
-)
-from extrap_train.reconstruction.depth_completion.training import (
-    DepthTraining,
-    StoredExamples,
-    loss_of,
-    save_examples,
 )
 from extrap_train.reconstruction.planner import Query
 from extrap_train.reconstruction.prior import prior_of
@@ -212,7 +212,7 @@ def test_weights_come_back_and_others_are_refused(tmp_path):
 
 
 @dataclass(frozen=True)
-class Painter:
+class ExactGenerator:
     """True pictures."""
 
     image_size = warp_size = SIZE
@@ -235,8 +235,8 @@ def test_a_view_enters_with_the_completed_depth_where_the_map_is_not_certain():
     views = [replace(view, mask=None) for view in front()]
     known = map_of_inputs(views, [(view.depth > 0).float() for view in views], 0.01)
     camera: Camera = scenes.orbit_camera(60.0, size=SIZE)
-    workshop = Workshop(Painter(), DatasetDepth(), CompletionConfig(), 0, exact)
-    _, added, step = add_view(known, Query("q", camera), workshop)
+    pipeline = CompletionPipeline(ExactGenerator(), DatasetDepth(), CompletionConfig(), 0, exact)
+    _, added, step = add_view(known, Query("q", camera), pipeline)
     truth = BALL.depth(camera)
     assert step.agreement > 0.9
     assert (added.confidence > 0.5)[truth > 0].float().mean() > 0.9

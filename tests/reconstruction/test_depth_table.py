@@ -1,4 +1,4 @@
-"""What the depth of painted views is worth to the completed scene, and how good that depth is.
+"""What the depth of generated views is worth to the completed scene, and how good that depth is.
 
 `python -m pytest -s -m slow tests/reconstruction/test_depth_table.py` prints the tables of
 docs/completion.md: six categories, captures of another seed than any that a model was trained or a
@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from extrap_train.config import CompletionConfig, StereoConfig, SyntheticConfig
-from extrap_train.data.scene import open_scene
+from extrap_train.data.scene_spec import open_scene
 from extrap_train.data.sequences import Frame
 from extrap_train.data.synthetic import SyntheticScene, build_scene, trace
 from extrap_train.depth.stereo import PlaneSweepStereo
@@ -22,8 +22,8 @@ from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.geometry.viewpoints import directions_from, scene_center
 from extrap_train.geometry.world_frame import WorldFrame
 from extrap_train.reconstruction.cloud import cloud_of
-from extrap_train.reconstruction.completion import Workshop, complete, map_of_inputs
-from extrap_train.reconstruction.depth_completion.completed import (
+from extrap_train.reconstruction.completion import CompletionPipeline, complete, map_of_inputs
+from extrap_train.reconstruction.depth_completion.inference import (
     CompletedDepth,
     DepthCompletion,
 )
@@ -33,7 +33,7 @@ from extrap_train.reconstruction.inputs import choose_frames, first_views, fit_w
 from extrap_train.reconstruction.planner import orbit_queries
 from extrap_train.reconstruction.prior import prior_of
 from extrap_train.reconstruction.report import cloud_scores
-from extrap_train.tasks.completed import SUBDIVIDE
+from extrap_train.tasks.completion_results import SUBDIVIDE
 from extrap_train.tasks.scene_model import open_model
 from extrap_train.views import View, stack_cameras, stack_poses
 
@@ -51,7 +51,7 @@ class Capture:
     scene: SyntheticScene
     world: WorldFrame
     inputs: GlobalMap
-    painter: DiffusionGenerator
+    generator: DiffusionGenerator
 
     @classmethod
     def open(cls, category: str, number: int) -> "Capture":
@@ -60,10 +60,12 @@ class Capture:
         chosen: list[Frame] = [frames[i] for i in choose_frames(frames, 3, (), "one_sided", 0)]
         world = fit_world_frame(stack_poses([frame.camera for frame in chosen]))
         model = open_model(f"ours-{category}")
-        painter = DiffusionGenerator(model, model.config.sampler)
+        generator = DiffusionGenerator(model, model.config.sampler)
         photographs = [frame.load() for frame in chosen]
-        views, sure = first_views(photographs, ExactDepth(scene, world), world, painter.warp_size)
-        return cls(scene, world, map_of_inputs(views, sure, CompletionConfig().tolerance), painter)
+        views, sure = first_views(photographs, ExactDepth(scene, world), world, generator.warp_size)
+        return cls(
+            scene, world, map_of_inputs(views, sure, CompletionConfig().tolerance), generator
+        )
 
     def truth(self, view: View) -> tuple[torch.Tensor, torch.Tensor]:
         """Depth in the map's unit, and the object's mask."""
@@ -71,11 +73,11 @@ class Capture:
         return depth / self.world.unit, mask > 0.5
 
     def completed(self, completion: DepthCompletion | None) -> GlobalMap:
-        workshop = Workshop(
-            self.painter, PlaneSweepStereo(StereoConfig()), CompletionConfig(), 0, completion
+        pipeline = CompletionPipeline(
+            self.generator, PlaneSweepStereo(StereoConfig()), CompletionConfig(), 0, completion
         )
         queries = orbit_queries(self.inputs.cameras, np.radians(30))
-        return complete(self.inputs, queries, workshop, lambda *_: None)
+        return complete(self.inputs, queries, pipeline, lambda *_: None)
 
     def scores(self, known: GlobalMap) -> dict[str, float]:
         cloud = cloud_of(known, votes=True, subdivide=SUBDIVIDE)

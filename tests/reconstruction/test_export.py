@@ -43,7 +43,7 @@ def known() -> GlobalMap:
     for index, name in enumerate(_NAMES):
         camera = scenes.orbit_camera(36.0 * index, size=_SIZE)
         view = View(_SCENE.image(camera), camera, _SCENE.depth(camera), name=name)
-        origin = Origin(GENERATED if index else GIVEN, front=0)
+        origin = Origin(GENERATED if index else GIVEN, root=0)
         grown, _ = grown.added(view, torch.ones(_SIZE, _SIZE), origin)
     return grown
 

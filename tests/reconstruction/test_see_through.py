@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from extrap_train.config import StereoConfig, SyntheticConfig
-from extrap_train.data.scene import open_scene
+from extrap_train.data.scene_spec import open_scene
 from extrap_train.depth.stereo import PlaneSweepStereo
 from extrap_train.geometry.viewpoints import directions_from, scene_center
 from extrap_train.geometry.visibility import Ball, trace_visibility

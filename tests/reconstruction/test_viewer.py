@@ -32,7 +32,7 @@ def _grown(count: int) -> GlobalMap:
     for index in range(count):
         camera = scenes.orbit_camera(60.0 * index, size=_SIZE)
         view = View(_SCENE.image(camera), camera, _SCENE.depth(camera), name=f"view{index}")
-        origin = Origin(GENERATED if index else GIVEN, front=0)
+        origin = Origin(GENERATED if index else GIVEN, root=0)
         known, _ = known.added(view, torch.ones(_SIZE, _SIZE), origin)
     return known
 

@@ -9,8 +9,8 @@ import torch
 
 from extrap_train.__main__ import main
 from extrap_train.config import ModelConfig, UNetConfig
-from extrap_train.diffusion.checkpoint import save_model
 from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.model_files import save_model
 
 _UNET = UNetConfig(channels=[16, 32], attention_levels=[False, True], heads=2, token_width=16)
 _TINY = ModelConfig(name="tiny", image_size=16, octaves=2, unet=_UNET)

@@ -107,7 +107,7 @@ def _map(folder: Path) -> Callable[[], object]:
     for index in range(4):
         image = torch.from_numpy(rng.random((3, 16, 16), np.float32))
         view = View(image, orbit_camera(20 * index, size=16), 2 + image[0], name=f"v{index}")
-        origin = Origin(GIVEN if index < 2 else GENERATED, front=min(index, 1))
+        origin = Origin(GIVEN if index < 2 else GENERATED, root=min(index, 1))
         known, added = known.added(view, torch.ones(16, 16), origin)
         step = Step(f"v{index}", 0.9, 1, 2, 30, None, {"plan": 0.1}) if index > 1 else None
         save_view(added, step, folder, index)

@@ -13,7 +13,7 @@ from extrap_train.config import (
     SyntheticConfig,
     TrainConfig,
 )
-from extrap_train.diffusion.checkpoint import load_model
+from extrap_train.diffusion.model_files import load_model
 from extrap_train.diffusion.packaged import packaged_weights
 from extrap_train.store.manifest import Conflict
 from extrap_train.tasks.pack import run

@@ -12,8 +12,8 @@ from extrap_train import open_generator
 from extrap_train.cli import register_schemas
 from extrap_train.config import ModelConfig, SamplerConfig, TrainConfig, UNetConfig, sampler_for
 from extrap_train.config.options import check_options
-from extrap_train.diffusion.checkpoint import load_model, save_model
 from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.model_files import load_model, save_model
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.errors import InputError
 

@@ -10,7 +10,7 @@ import pytest
 from extrap_train import open_generator
 from extrap_train.__main__ import main
 from extrap_train.config import ModelConfig
-from extrap_train.diffusion.checkpoint import load_model
+from extrap_train.diffusion.model_files import load_model
 from extrap_train.diffusion.packaged import packaged_weights
 from extrap_train.errors import InputError
 

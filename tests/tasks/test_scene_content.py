@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from extrap_train.data.scene import open_scene
+from extrap_train.data.scene_spec import open_scene
 from extrap_train.tasks.scene_inputs import photograph_digests
 
 _NAMES = ["0.png", "1.png", "2.png"]

@@ -1,4 +1,4 @@
-"""What goes wrong while a scene is painted or adapted to is one line that says what to turn."""
+"""What goes wrong while a scene is generated or adapted to is one line that says what to turn."""
 
 import json
 import math
@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from extrap_train.cli import register_schemas, typed_config
-from extrap_train.diffusion.checkpoint import load_model, save_model
 from extrap_train.diffusion.generator import sample_views
+from extrap_train.diffusion.model_files import load_model, save_model
 from extrap_train.errors import InputError
 from extrap_train.store.records import write_summary
 
@@ -43,7 +43,7 @@ def test_a_summary_has_no_nan_wherever_it_stands(tmp_path) -> None:
     assert found == {"losses": [[0, None], [1, 0.5]], "psnr": {"all": None}}
 
 
-def test_memory_that_ends_in_painting_is_one_line(
+def test_memory_that_ends_in_generation_is_one_line(
     command, refused, weights, tmp_path, monkeypatch
 ) -> None:
     """Two views at a time fit."""

@@ -9,7 +9,7 @@ import torch
 from captures import write_capture
 from filelock import FileLock
 
-from extrap_train.diffusion.checkpoint import load_model, save_model
+from extrap_train.diffusion.model_files import load_model, save_model
 from extrap_train.tasks import scene
 
 _SHORT = ["minutes=0.2", "lora.steps=1", "lora.validate_every=1", "sampler.steps=1"]

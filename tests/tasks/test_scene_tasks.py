@@ -14,10 +14,10 @@ from PIL import Image
 
 from extrap_train import open_generator, open_views, walk_around
 from extrap_train.config import LoraConfig, SyntheticConfig
-from extrap_train.data.scene import open_scene
-from extrap_train.diffusion.checkpoint import load_model, save_model
+from extrap_train.data.scene_spec import open_scene
 from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.diffusion.lora import AdapterOrigin, add_adapter, save_adapter
+from extrap_train.diffusion.model_files import load_model, save_model
 from extrap_train.pictures import picture_names
 from extrap_train.tasks.scene_inputs import frame_digest
 
@@ -212,14 +212,14 @@ def test_a_damaged_adapter_is_made_again_and_one_of_other_weights_is_kept(
     )
 
 
-def test_before_a_run_the_category_s_packaged_model_paints_and_says_so(
+def test_before_a_run_the_category_s_packaged_model_generates_and_says_so(
     command, tmp_path, capsys
 ) -> None:
     command("task=view", "pose=frame000003")
-    assert "painted with ours-hydrant (packaged, 1,200 steps)" in capsys.readouterr().out
+    assert "generated with ours-hydrant (packaged, 1,200 steps)" in capsys.readouterr().out
     summary = json.loads((tmp_path / "view" / "hydrant-0000" / "summary.json").read_text())
-    assert summary["painted_with"]["name"] == "ours-hydrant"
-    assert len(summary["painted_with"]["sha256"]) == 64
+    assert summary["generated_with"]["name"] == "ours-hydrant"
+    assert len(summary["generated_with"]["sha256"]) == 64
     assert len(summary["photographs"]) == 4
     assert Image.open(tmp_path / "view" / "hydrant-0000" / "truth.png").size == (64, 64)
 
@@ -261,7 +261,7 @@ def _adapter_of(weights: Path, folder: Path, *frames: str) -> Path:
     return folder
 
 
-def test_no_held_out_view_is_painted_from_where_it_stands_nor_by_who_has_learnt_it(
+def test_no_held_out_view_is_generated_from_where_it_stands_nor_by_who_has_learnt_it(
     command, weights, tmp_path, monkeypatch
 ) -> None:
     """Completed at the capture's own poses, the map has a view where each photograph was taken."""

@@ -41,13 +41,13 @@ def warp_references(
     """
     depths = torch.where(valid[..., None, None], depths, 0)
     if needs_torch(images, depths):
-        # §1.1: unproject, cull what faces away or lies behind unseen space, project: points as
+        # Unproject, cull what faces away or lies behind unseen space, project: points as
         # dense as the query sees them.
         samples = sample_surfaces(images, depths, cameras, query)
         points = samples.points
         if flows is not None:
             points = move_points(points, samples.reference, flows, query)
-        # §1.2–1.4, Eq. 1: one splat by depth of colours, coordinates and depth of all references.
+        # Eq. 1: one splat by depth of colours, coordinates and depth of all references.
         means = splat_torch(points, samples.values, (len(images), query.height, query.width))
     else:
         drawn = sample_surfaces_numba(images, depths, cameras, query)

@@ -34,14 +34,13 @@ def is_occluded(
     cameras: Camera,
     query: Camera,
     points: ScreenPoints,
+    reference: Int[Tensor, " n"],
 ) -> Bool[Tensor, " n"]:
-    """Which points lie behind space that their reference never saw; here `image` counts the b·k
-    references."""
+    """Which points lie behind space that their reference, one of b·k, never saw."""
     column = points.u.long().clamp(0, query.width - 1)
     row = points.v.long().clamp(0, query.height - 1)
-    limit = occlusion_depth(surface, matrix, cameras, query).flatten(0, 1)[
-        points.image, row, column
-    ]
+    limits = occlusion_depth(surface, matrix, cameras, query).flatten(0, 1)
+    limit = limits[reference, row, column]
     return points.depth > limit * (1 + TOLERANCE)
 
 

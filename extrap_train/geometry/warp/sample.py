@@ -52,19 +52,19 @@ def sample_surfaces(
     values: in torch, differentiable in images and depths."""
     b, k, _, h, w = images.shape
     # Normals, and where depth jumps. The query's centre must lie on the reference's side of the
-    # tangent plane n·x = 1, or the query sees the surface's back (METHOD §1.1).
+    # tangent plane n·x = 1, or the query sees the surface's back.
     surface = surface_from_depth(depths, cameras)
     towards = plane_vectors(surface, cameras) * query_centers(cameras, query)[..., None, None, :]
     x, y, z = towards.unbind(-1)
     drawn = surface.valid & (x + y + z < 1)
     # Cut every pixel into as many points as keep them `LARGEST_SPACING` apart in the query.
     matrix = reference_to_query_pixels(cameras, query)
-    steps = _steps(surface, matrix)
+    steps = _query_steps(surface, matrix)
     counts = torch.where(drawn[..., None], _points_per_axis(steps), 0).reshape(-1, 2)
     pixel, offset = subdivide(counts)
     corner = _Corner.around(surface, pixel, offset)
     # K_q (R K_r⁻¹ (u, v, 1) + t/z): inverse depth is linear on the surface.
-    inverse = surface.inverse_depth.reshape(-1)[pixel] + corner.steps(offset)
+    inverse = surface.inverse_depth.reshape(-1)[pixel] + corner.inverse_depth_change(offset)
     u, v, ratio = project_pixels(
         matrix.reshape(-1, 3, 4)[pixel // (h * w)],
         pixel % w + 0.5 + offset[:, 0],
@@ -73,18 +73,20 @@ def sample_surfaces(
     )
     inside = (u > -0.5) & (u < query.width + 0.5) & (v > -0.5) & (v < query.height + 0.5)
     seen = (inside & (inverse > 0) & (ratio > LEAST_DEPTH_RATIO)).nonzero()[:, 0]
-    cells = (steps.reshape(-1, 2, 2)[pixel[seen]] / counts[pixel[seen], :, None]).abs()
-    reach = ((cells[:, 0] + cells[:, 1]) / 2 + REACH_MARGIN).clamp(max=1)
+    # A point stands for a parallelogram of the query; it reaches half of that one's bounding box.
+    edges = (steps.reshape(-1, 2, 2)[pixel[seen]] / counts[pixel[seen], :, None]).abs()
+    reach = ((edges[:, 0] + edges[:, 1]) / 2 + REACH_MARGIN).clamp(max=1)
     reference = (pixel // (h * w))[seen]
     depth = (ratio / inverse)[seen]
-    points = ScreenPoints(u[seen], v[seen], depth, reach[:, 0], reach[:, 1], reference)
+    points = ScreenPoints(u[seen], v[seen], depth, reach[:, 0], reach[:, 1], reference // k)
     # Drop what lies behind space that its reference never saw, then interpolate what is left.
-    kept = (~is_occluded(surface, matrix, cameras, query, points)).nonzero()[:, 0]
+    occluded = is_occluded(surface, matrix, cameras, query, points, reference)
+    kept = (~occluded).nonzero()[:, 0]
     points = points[kept]
     maps = _maps(images).movedim(2, -1).reshape(b * k * h * w, -1)
     values = corner.interpolate(maps, pixel, offset, seen[kept])
     values = torch.cat([values, points.depth[:, None]], 1)
-    return Samples(replace(points, image=points.image // k), values, points.image)
+    return Samples(points, values, reference[kept])
 
 
 def query_centers(cameras: Camera, query: Camera) -> Float[Tensor, "b k 3"]:
@@ -101,7 +103,9 @@ def _maps(images: Float[Tensor, "b k 3 h w"]) -> Float[Tensor, "b k 6 h w"]:
     return torch.cat([images, grid * nearest, nearest], 2)
 
 
-def _steps(surface: Surface, matrix: Float[Tensor, "b k 3 4"]) -> Float[Tensor, "b k h w 2 2"]:
+def _query_steps(
+    surface: Surface, matrix: Float[Tensor, "b k 3 4"]
+) -> Float[Tensor, "b k h w 2 2"]:
     """How far (u, v) in the query moves for a step of one reference pixel along u, and along v."""
     h, w = surface.inverse_depth.shape[-2:]
     grid = pixel_grid(h, w, matrix.device).to(matrix.dtype)
@@ -145,8 +149,8 @@ class _Corner:
         neighbour = pixel[:, None] + torch.where(connected, step, 0)
         return cls(surface.slopes.reshape(-1)[flat], neighbour)
 
-    def steps(self, offset: Float[Tensor, "m 2"]) -> Float[Tensor, " m"]:
-        """Change of inverse depth from the pixel's centre."""
+    def inverse_depth_change(self, offset: Float[Tensor, "m 2"]) -> Float[Tensor, " m"]:
+        """From the pixel's centre to the offset, along the surface."""
         across, down = (self.slope * offset).unbind(-1)
         return across + down
 

@@ -23,7 +23,7 @@ OUTSIDE = -10.0
 
 @dataclass(frozen=True)
 class ScreenPoints:
-    """Points seen by cameras of one image size: `image` says by which, in ascending order."""
+    """Points projected into images of one size."""
 
     u: Float[Tensor, " n"]
     v: Float[Tensor, " n"]
@@ -33,6 +33,7 @@ class ScreenPoints:
     """Half the width, in pixels up to 1, of the piece of surface that the point stands for."""
     reach_v: Float[Tensor, " n"]
     image: Int[Tensor, " n"]
+    """Which of the images a point is drawn into, in ascending order."""
 
     def __getitem__(self, chosen: Int[Tensor, " m"]) -> "ScreenPoints":
         """The points with these indices."""

@@ -1,3 +1,3 @@
-"""Dense depth of a painted view: its picture and what the map knows of it go in, depth with a
+"""Dense depth of a generated view: its picture and what the map knows of it go in, depth with a
 calibrated confidence comes out.
 """

@@ -13,7 +13,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from extrap_train.config import ModelConfig
-from extrap_train.diffusion.checkpoint import initial_model
+from extrap_train.diffusion.model_files import initial_model
 from extrap_train.errors import InputError
 
 _FIRST = "model.diffusion_model.input_blocks.0.0.weight"

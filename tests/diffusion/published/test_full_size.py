@@ -8,8 +8,8 @@ import pytest
 import torch
 from published_networks import configured
 
-from extrap_train.diffusion.checkpoint import load_weights
 from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.model_files import load_weights
 
 
 def _layout(folder: Path, family: str) -> dict[str, list[int]]:

@@ -11,7 +11,7 @@ import torch
 from published_networks import Reference, tiny_config
 
 from extrap_train.config import ModelConfig
-from extrap_train.diffusion.checkpoint import initial_model, published_model, save_model
+from extrap_train.diffusion.model_files import initial_model, published_model, save_model
 from extrap_train.errors import InputError
 
 

@@ -13,10 +13,10 @@ from published_networks import Reference, tiny_config
 from torch import Tensor
 
 from extrap_train.config import SamplerConfig
-from extrap_train.diffusion.checkpoint import initial_model
 from extrap_train.diffusion.conditioning import Conditioning
 from extrap_train.diffusion.encoders import clip_input
 from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.model_files import initial_model
 from extrap_train.diffusion.sampler import ddim_timesteps, guided_denoiser, sample_ddim
 
 

@@ -1,4 +1,4 @@
-"""A published checkpoint paints a scene and is adapted to it, by `weights=` and `model=` alone."""
+"""A published checkpoint serves the tasks about a scene, by `weights=` and `model=` alone."""
 
 import json
 import sys
@@ -12,7 +12,7 @@ from safetensors.torch import load_file
 
 from extrap_train import open_generator
 from extrap_train.__main__ import main
-from extrap_train.diffusion.checkpoint import initial_model, save_model
+from extrap_train.diffusion.model_files import initial_model, save_model
 from extrap_train.errors import InputError
 
 _SCENE = ["category=hydrant", "scene=synthetic:hydrant/0000", "data.frames=6", "data.image_size=32"]
@@ -35,13 +35,13 @@ def command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     return run
 
 
-def test_it_paints(command, reference: Reference, checkpoint: Path, tmp_path: Path) -> None:
+def test_it_generates(command, reference: Reference, checkpoint: Path, tmp_path: Path) -> None:
     command(reference.family, checkpoint, "task=view", "inputs=3", "pose=frame000003")
     folder = tmp_path / "view" / "hydrant-0000"
     assert Image.open(folder / "views" / "frame000003.png").size == (256, 256)
 
 
-def test_a_plain_diffusers_folder_paints(
+def test_a_plain_diffusers_folder_generates(
     command, references: dict[str, Reference], tmp_path: Path
 ) -> None:
     """As diffusers itself leaves it: without our configuration beside it."""
@@ -89,10 +89,10 @@ def test_of_another_size_than_the_model_it_says_which_option(
     ("found", "asked"),
     [("zeronvs", "ours"), ("zeronvs", "megascenes"), ("megascenes", "ours")],
 )
-def test_another_family_is_a_start_and_paints_nothing(
+def test_another_family_is_a_start_and_generates_nothing(
     command, references: dict[str, Reference], tmp_path: Path, found: str, asked: str
 ) -> None:
-    """Widened, it would paint without a word as though there were no warp."""
+    """Widened, it would generate without a word as though there were no warp."""
     path = tmp_path / f"{found}.ckpt"
     torch.save({"state_dict": references[found].state}, path)
     with pytest.raises(SystemExit) as stopped:

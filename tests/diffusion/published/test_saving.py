@@ -9,7 +9,7 @@ from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
 from published_networks import Reference, tiny_config
 from transformers import CLIPVisionModelWithProjection
 
-from extrap_train.diffusion.checkpoint import initial_model, load_model, save_model
+from extrap_train.diffusion.model_files import initial_model, load_model, save_model
 
 
 def test_plain_diffusers_loads_it_and_so_do_we(

@@ -1,4 +1,4 @@
-"""A published checkpoint trains for a few steps, is saved, comes back and paints a view.
+"""A published checkpoint trains for a few steps, is saved, comes back and generates a view.
 
 `_trains` takes the model's loss and the optimiser in a loop of its own: no Trainer, no averaged
 weights, no warm-up. The last test has these: it gives the tiny network to the real task.
@@ -19,8 +19,8 @@ from published_networks import TINY_MODEL, Reference, configured, tiny_config
 from benchmarks.perf.diffusion_case import batch_of
 from extrap_train.__main__ import main
 from extrap_train.config import ModelConfig, SamplerConfig, TrainConfig, TrainerConfig
-from extrap_train.diffusion.checkpoint import initial_model, load_model, save_model
 from extrap_train.diffusion.loss import diffusion_loss
+from extrap_train.diffusion.model_files import initial_model, load_model, save_model
 from extrap_train.diffusion.sampler import sample_views
 from extrap_train.diffusion.training import CategoryTraining
 

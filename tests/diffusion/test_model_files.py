@@ -15,8 +15,8 @@ import torch
 from diffusers import DDIMScheduler, UNet2DConditionModel
 
 from extrap_train.config import ModelConfig
-from extrap_train.diffusion.checkpoint import initial_model, load_model, save_model
 from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.model_files import initial_model, load_model, save_model
 from extrap_train.errors import InputError
 from extrap_train.views import PairBatch
 

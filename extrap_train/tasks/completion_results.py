@@ -20,10 +20,10 @@ from extrap_train.geometry.world_frame import WorldFrame
 from extrap_train.metrics import lpips_or_reason, psnr, quantised, ssim
 from extrap_train.pictures import colour_depth, contact_sheet, error_map, mark_holes
 from extrap_train.reconstruction.cloud import PointCloud, cloud_of
-from extrap_train.reconstruction.completion import REFERENCES, Step, Workshop
+from extrap_train.reconstruction.cloud_pictures import draw_growth, draw_turntable
+from extrap_train.reconstruction.completion import REFERENCES, CompletionPipeline, Step
 from extrap_train.reconstruction.export import write_cloud, write_colmap, write_views
 from extrap_train.reconstruction.global_map import GENERATED, GIVEN, GlobalMap, MapView
-from extrap_train.reconstruction.growth import draw_growth, draw_turntable
 from extrap_train.reconstruction.inputs import stand_where
 from extrap_train.reconstruction.prior import prior_of
 from extrap_train.reconstruction.report import (
@@ -62,7 +62,7 @@ def write_completed(
     done: Completed,
     config: TrainConfig,
     sequence: FrameSequence,
-    workshop: Workshop,
+    pipeline: CompletionPipeline,
     used: UsedWeights | None,
     folder: Path,
     console: Console,
@@ -85,12 +85,12 @@ def write_completed(
     splats, no_splats = _splats(done, config, folder)
     done.seconds["splats"] = time.perf_counter() - started
     started = time.perf_counter()
-    held_out, missing = _compare_held_out(done, config, sequence, workshop, folder)
+    held_out, missing = _compare_held_out(done, config, sequence, pipeline, folder)
     metrics = _metrics(done, cloud)
     done.seconds["measure"] = time.perf_counter() - started
     given = {view.view.name for view in done.known.views if view.origin.kind == GIVEN}
     summary = {
-        "painted_with": asdict(used) if used else "exact renderings",
+        "generated_with": asdict(used) if used else "exact renderings",
         "photographs": photograph_digests(f for f in sequence.frames if f.name in given),
         "views": {kind: _count(done.known, kind) for kind in (GIVEN, GENERATED)},
         "points": len(cloud),
@@ -107,7 +107,7 @@ def write_completed(
         "provenance": provenance(config, {"scene": config.scene or ""}),
     }
     write_summary(folder, summary)
-    console.print(f"painted with {used or 'exact renderings of the scene'}")
+    console.print(f"generated with {used or 'exact renderings of the scene'}")
     _print_what_was_added(done, summary, config, console)
     _print(summary, console)
     console.print(f"pictures: {folder / 'growth.png'}\nresult: {folder}")
@@ -184,7 +184,11 @@ def _draw_views(known: GlobalMap, path: Path) -> None:
 
 
 def _compare_held_out(
-    done: Completed, config: TrainConfig, sequence: FrameSequence, workshop: Workshop, folder: Path
+    done: Completed,
+    config: TrainConfig,
+    sequence: FrameSequence,
+    pipeline: CompletionPipeline,
+    folder: Path,
 ) -> tuple[dict[str, float | None] | None, dict[str, str]]:
     """Views generated at the poses of photographs that were no inputs, against these."""
     given = done.known.views[: _count(done.known, GIVEN)]
@@ -192,7 +196,7 @@ def _compare_held_out(
     frames = _held_out(given, done.world, sequence, known)[: config.complete.held_out]
     if not frames or config.complete.generator == "exact":
         return None, {}
-    size = workshop.generator.image_size
+    size = pipeline.generator.image_size
     truth = [view.squared(size) for view in load_readable(frames)]
     if not truth:
         return None, {}
@@ -202,7 +206,7 @@ def _compare_held_out(
     for view, camera in zip(truth, cameras, strict=True):
         near = [done.known.views[i].view for i in _elsewhere(done.known, camera)]
         query = stack_cameras([camera])
-        generated = workshop.generator.generate(near, query, [view.name], config.seed)
+        generated = pipeline.generator.generate(near, query, [view.name], config.seed)
         made.append(generated.images[0])
         seen = prior_of(only, camera, only.nearest(camera, REFERENCES))
         warps.append(mark_holes(seen.image[None], seen.mask.float()[None])[0])
@@ -246,7 +250,7 @@ def _held_out(
 
 def _elsewhere(known: GlobalMap, camera: Camera) -> list[int]:
     """The nearest views that do not stand where the camera does: `complete.poses=capture` has made
-    views there, which would be painted from themselves.
+    views there, which would be generated from themselves.
     """
     there = stand_where(camera, known.cameras, np.zeros(3))
     return [i for i in known.nearest(camera, len(known)) if not there[i]][:REFERENCES]
@@ -267,7 +271,7 @@ def _print(summary: dict[str, Any], console: Console) -> None:
         again = "" if summary["splats"]["seconds"] else ", used again"
         console.print(f"splats: {count:.0f} Gaussians show the views at {score:.2f} dB{again}")
     error = summary["loop"]["largest_error"]
-    met = "fronts did not meet" if error is None else f"{100 * error:.2f} % of the scene's size"
+    met = "branches did not meet" if error is None else f"{100 * error:.2f} % of the scene's size"
     console.print(f"loop closure: {met}")
     for name, reason in summary["missing"].items():
         console.print(f"missing {name}: {reason}")

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from extrap_train.diffusion.resume import (
+from extrap_train.diffusion.checkpoints import (
     WholeCheckpointIO,
     checkpoints,
     find_damage,

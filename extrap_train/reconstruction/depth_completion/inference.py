@@ -1,4 +1,4 @@
-"""The depth of a painted view from the network, fitted to what the map knows."""
+"""The depth of a generated view from the network, fitted to what the map knows."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ class CompletedDepth:
 
 
 class DepthCompletion(Protocol):
-    """Whatever completes the depth of a painted view; a test's oracle is one, too."""
+    """Whatever completes the depth of a generated view; a test's oracle is one, too."""
 
     def __call__(self, known: GlobalMap, picture: View, indices: Sequence[int]) -> CompletedDepth:
         """The depth of a picture, of which the map's views `indices` show parts."""

@@ -12,7 +12,7 @@ from torch.optim import AdamW
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from extrap_train.config import TrainerConfig
-from extrap_train.diffusion.resume import WholeCheckpointIO, find_damage
+from extrap_train.diffusion.checkpoints import WholeCheckpointIO, find_damage
 from extrap_train.diffusion.training import rate_at
 from extrap_train.errors import InputError
 from extrap_train.reconstruction.depth_completion.examples import DepthExamples

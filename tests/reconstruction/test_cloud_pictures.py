@@ -11,8 +11,8 @@ from PIL import Image
 
 from extrap_train.geometry.cameras import project
 from extrap_train.reconstruction.cloud import PointCloud
+from extrap_train.reconstruction.cloud_pictures import FRAMED, PICTURE_SIZE, draw_growth, framed
 from extrap_train.reconstruction.global_map import GENERATED, GIVEN, GlobalMap, Origin
-from extrap_train.reconstruction.growth import FRAMED, PICTURE_SIZE, draw_growth, framed
 from extrap_train.views import View, combine, stack_cameras
 
 
@@ -43,7 +43,7 @@ def test_the_last_picture_of_the_strip_shows_what_lies_far_out(tmp_path: Path) -
     for index in range(3):
         camera = scenes.orbit_camera(40.0 * index, elevation_deg=30.0, size=16)
         view = View(torch.rand(3, 16, 16), camera, torch.ones(16, 16), name=str(index))
-        origin = Origin(GENERATED if index == 2 else GIVEN, front=0)
+        origin = Origin(GENERATED if index == 2 else GIVEN, root=0)
         known, _ = known.added(view, torch.ones(16, 16), origin)
     radius = float(known.cameras.center[0].norm())
     turn = torch.linspace(0, 2 * torch.pi, 400)
