@@ -27,6 +27,7 @@ from benchmarks.run.cells import (
     keep_output,
     score_cell,
     write_failure,
+    write_plan,
 )
 from benchmarks.run.method_content import MISSING_WEIGHTS, is_ours, method_contents
 from benchmarks.run.plan import (
@@ -49,7 +50,7 @@ from extrap_train.jobs.guests import AsGuest, GuestLauncher
 from extrap_train.jobs.local import LocalLauncher
 from extrap_train.jobs.slurm import slurm_launcher
 from extrap_train.store.atomic import file_lock, remove_leftovers
-from extrap_train.store.records import read_record, write_record
+from extrap_train.store.records import read_record
 from extrap_train.terminal import progress, terminal
 
 _CELLS_PER_SCORER = 8
@@ -149,7 +150,7 @@ def _run(
             f"{kept} of {len(jobs)} cells are kept in {folder.path}; run the same command again "
             "to go on"
         ) from None
-    write_record(folder.plan, plan)
+    write_plan(folder.plan, plan)
     return _report(folder, catalogue, [*made, *scored], console)
 
 

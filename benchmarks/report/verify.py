@@ -12,7 +12,7 @@ from benchmarks.protocol.draws import Draw, Protocol
 from benchmarks.protocol.prepared_scene import Scene
 from benchmarks.report.aggregate import UNIT, Results, read_results
 from benchmarks.report.formats import tables
-from benchmarks.run.cells import OK, Cell, files_of
+from benchmarks.run.cells import OK, Cell, files_of, is_plan_unchanged
 from benchmarks.run.identity import cell_key, image_options, judged_columns, scores_manifest
 from benchmarks.run.plan import TableFolder, selected_draws
 from benchmarks.score import Score
@@ -97,6 +97,8 @@ def _protocol_problems(results: Results, made: Sequence[tuple[str, Draw]]) -> It
         yield str(error)
         return
     file, table = results.folder.plan, results.plan.table
+    if not is_plan_unchanged(file):
+        yield f"{file}: was changed after the run, as in its titles; run the table again"
     if protocol.sha256 != results.plan.protocol:
         yield f"{results.folder.protocol}: is not the protocol that the results carry"
     if asdict(protocol.rules) != asdict(table.rules):

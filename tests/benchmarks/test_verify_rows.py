@@ -54,6 +54,30 @@ def test_options_of_a_row_that_the_images_were_not_made_with_are_noticed(copy: P
     assert "light was not made with the options that its table gives" in said
 
 
+def _swap_titles(plan: dict[str, Any]) -> None:
+    dark, light = plan["methods"]["dark"], plan["methods"]["light"]
+    dark["title"], light["title"] = light["title"], dark["title"]
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        _swap_titles,
+        lambda plan: plan["methods"]["dark"].update(group="the best"),
+        lambda plan: plan["methods"]["dark"].update(time="per image"),
+        lambda plan: plan["table"].update(title="Results on CO3D"),
+        lambda plan: plan["table"].update(reported="megascenes"),
+        lambda plan: plan.pop("sha256"),
+    ],
+)
+def test_what_the_report_would_say_of_a_row_is_noticed(edit: Edit, copy: Path) -> None:
+    """No cell states it, and every number stays as it was."""
+    folder = greys_folder(copy)
+    _edit(folder.plan, edit)
+    (problem,) = verify(folder).problems
+    assert str(folder.plan) in problem
+
+
 def test_a_cell_that_the_plan_has_lost_is_missed(copy: Path) -> None:
     folder = greys_folder(copy)
     _edit(folder.plan, lambda plan: plan["cells"].pop())
