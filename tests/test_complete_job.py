@@ -11,8 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from in_process import run_command
 from plyfile import PlyData
 
+from extrap_train.__main__ import main
 from extrap_train.data.scene_spec import open_scene
 from extrap_train.gaussians.ply import read_splats
 from extrap_train.gaussians.rasterize import draw, rasterizer
@@ -33,8 +35,8 @@ _TINY = [
 ]
 
 
-def _start(output: Path, *more: str) -> "subprocess.Popen[bytes]":
-    command = [sys.executable, "-m", "extrap_train", *_TINY, f"output={output}", *more]
+def _start(output: Path) -> "subprocess.Popen[bytes]":
+    command = [sys.executable, "-m", "extrap_train", *_TINY, f"output={output}"]
     environment = os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     output.mkdir(parents=True, exist_ok=True)
     with (output / "log.txt").open("wb") as log:
@@ -42,11 +44,7 @@ def _start(output: Path, *more: str) -> "subprocess.Popen[bytes]":
 
 
 def _finish(output: Path, *more: str, status: int = 0) -> str:
-    process = _start(output, *more)
-    process.wait(timeout=600)
-    said = (output / "log.txt").read_text()
-    assert process.returncode == status, said
-    return said
+    return run_command(main, *_TINY, f"output={output}", *more, status=status)
 
 
 @pytest.fixture(scope="module")
