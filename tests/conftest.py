@@ -12,7 +12,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numba
 import pytest
 import torch
-from shape_checks import check_shapes
+from shape_checks import check_shapes, forget_checks
 
 check_shapes()
 
@@ -79,6 +79,11 @@ _use_one_thread()  # before fixtures of whole modules
 def _one_thread() -> None:
     """Small scenes gain nothing from a second thread, and threads that wait for work cost time."""
     _use_one_thread()
+
+
+@pytest.fixture(autouse=True)
+def _shapes_are_checked_in_every_test() -> None:
+    forget_checks()
 
 
 @pytest.fixture

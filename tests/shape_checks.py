@@ -1,28 +1,39 @@
 """Checks the shapes of tensors wherever a public function of ours is called.
 
 jaxtyping's own import hook wraps every function, private ones in inner loops too, and takes ten
-times as long to import.
+times as long to import. Within a test, arguments of the same types and shapes are checked once: a
+fit calls the same functions a thousand times.
 """
 
 import inspect
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import is_dataclass
+from functools import wraps
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 from beartype import beartype
 from jaxtyping import jaxtyped
+from torch import Tensor
 
 _PACKAGES = {"extrap_train", "data_prep", "benchmarks"}
+_SEEN: set[tuple[Any, ...]] = set()
+"""Functions with the types and shapes of arguments that they have passed with."""
 
 
 def check_shapes() -> None:
     """Check every module of ours that is imported from now on."""
     assert not _PACKAGES & set(sys.modules), "imported before their shapes could be checked"
     sys.meta_path.insert(0, _Finder())
+
+
+def forget_checks() -> None:
+    """Check everything again, so that a test fails whichever ran before it."""
+    _SEEN.clear()
 
 
 class _Finder(MetaPathFinder):
@@ -50,17 +61,42 @@ class _Loader(SourceFileLoader):
                 _check_class(member)
 
 
-def _check_class(cls: type) -> None:
+def _check_class(cls: Any) -> None:
     if is_dataclass(cls) and _has_shapes(cls):
-        _checked(cls)
+        plain = cls.__init__
+        jaxtyped(typechecker=beartype)(cls)
+        cls.__init__ = _once_checked(plain, cls.__init__)
     for name, member in list(vars(cls).items()):
         public = name == "__call__" or not name.startswith("_")
         if public and inspect.isfunction(member) and _has_shapes(member):
             setattr(cls, name, _checked(member))
 
 
-def _checked(member: Any) -> Any:
-    return jaxtyped(typechecker=beartype)(member)
+def _checked(function: Callable) -> Callable:
+    return _once_checked(function, jaxtyped(typechecker=beartype)(function))
+
+
+def _once_checked(plain: Callable, checked: Callable) -> Callable:
+    """`checked` for arguments that this test has not yet called it with, else `plain`."""
+
+    @wraps(plain)
+    def call(*arguments: Any, **options: Any) -> Any:
+        kinds = (plain, *map(_kind, arguments), *options, *map(_kind, options.values()))
+        if kinds in _SEEN:
+            return plain(*arguments, **options)
+        result = checked(*arguments, **options)
+        _SEEN.add(kinds)
+        return result
+
+    return call
+
+
+def _kind(value: Any) -> tuple[Any, ...]:
+    if isinstance(value, Tensor | np.ndarray):
+        return type(value), value.shape, value.dtype
+    if isinstance(value, list | tuple):
+        return type(value), len(value), *map(_kind, value[:8])
+    return (type(value),)
 
 
 def _has_shapes(member: type | Callable) -> bool:

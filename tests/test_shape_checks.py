@@ -32,3 +32,14 @@ def test_a_dataclass_checks_its_fields() -> None:
 def test_a_method_checks_its_arguments() -> None:
     with pytest.raises(TypeCheckError):
         SmallImageEncoder(32)(torch.zeros(3, 8, 8))
+
+
+def test_calls_that_have_passed_let_no_other_shape_pass() -> None:
+    camera = orbit_camera(0, size=8)
+    for _ in range(2):
+        psnr(torch.zeros(1, 3, 8, 8), torch.zeros(1, 3, 8, 8))
+        View(torch.zeros(3, 8, 8), camera)
+    with pytest.raises(TypeCheckError):
+        psnr(torch.zeros(1, 3, 8, 8), torch.zeros(1, 3, 9, 8))
+    with pytest.raises(TypeCheckError):
+        View(torch.zeros(4, 8, 8), camera)

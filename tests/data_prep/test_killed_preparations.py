@@ -70,9 +70,15 @@ def contents(output: Path) -> dict[str, bytes]:
 
 
 def workers_of(run: "subprocess.Popen[str]") -> list[int]:
-    children = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()
-    spawned = [Path(f"/proc/{pid}/cmdline").read_bytes() for pid in children]
-    return [int(p) for p, line in zip(children, spawned, strict=True) if b"spawn_main" in line]
+    """The children of the run's fork server."""
+    (server,) = (
+        p for p in children(run.pid) if b"forkserver" in Path(f"/proc/{p}/cmdline").read_bytes()
+    )
+    return children(server)
+
+
+def children(process: int) -> list[int]:
+    return [*map(int, Path(f"/proc/{process}/task/{process}/children").read_text().split())]
 
 
 @pytest.fixture(scope="module")
