@@ -3,8 +3,6 @@
 Light on purpose (no torch): `benchmark list` and `--help` answer at once.
 """
 
-import os
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +12,11 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import conf
-from extrap_train.command_options import CommandOptions, choices_of
+from extrap_train.command_options import CommandOptions, choices_of, open_own_folders
 from extrap_train.config import (
     LPIPS_NETS,
     CapturesConfig,
+    DepthConfig,
     MethodConfig,
     SyntheticConfig,
     TableConfig,
@@ -38,15 +37,7 @@ class Catalogue:
     @classmethod
     def with_own(cls, own: Sequence[str] = ()) -> "Catalogue":
         """With own folders, which methods are imported from, in worker processes, too."""
-        folders = [str(Path(name).resolve()) for name in own]
-        for folder in folders:
-            if not Path(folder).is_dir():
-                raise InputError(f"--config-dir {folder}: no such folder")
-            sys.path.insert(0, folder)
-        if folders:
-            paths = [*folders, *filter(None, [os.environ.get("PYTHONPATH")])]
-            os.environ["PYTHONPATH"] = os.pathsep.join(paths)
-        return cls(tuple(folders))
+        return cls(tuple(open_own_folders(own)))
 
     def names(self, kind: str) -> list[str]:
         """Names of the `table`s, `method`s or `reported` numbers."""
@@ -71,6 +62,25 @@ class Catalogue:
         method.options |= options or {}
         return method
 
+    def depth(self, name: str) -> DepthConfig:
+        """A depth source's options by its name, as `depth=` composes them."""
+        from hydra import compose, initialize_config_module
+        from hydra.errors import HydraException
+
+        from extrap_train.cli import PREP, register_schemas
+        from extrap_train.command_line import explain
+
+        register_schemas()
+        words = [f"depth={name}", f"hydra.searchpath=[{','.join(f'file://{f}' for f in self.own)}]"]
+        try:
+            with initialize_config_module("conf", version_base="1.3"):
+                composed = OmegaConf.to_object(compose("prep", words).depth)
+        except (HydraException, OmegaConfBaseException) as error:
+            raise InputError(f"rules.depth={name}: {explain(error, PREP, words)}") from None
+        assert isinstance(composed, DepthConfig)
+        check_options(composed, "depth.")
+        return composed
+
     def table(self, name: str, overrides: Sequence[str] = ()) -> TableConfig:
         """A table by name, with `key=value` on top, composed as every other command's options."""
         table = _compose(name, self.content("table", name), overrides)
@@ -80,6 +90,7 @@ class Catalogue:
     def check(self, table: TableConfig) -> None:
         """InputError for options that exclude each other, and for names that are unknown."""
         _check_table(table)
+        _require_known("rules.depth", [table.rules.depth], choices_of("depth", self.own))
         _require_known("options", table.options, self.names("method"))
         _require_known("reported", filter(None, [table.reported]), self.names("reported"))
         for method in table.methods:

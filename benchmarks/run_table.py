@@ -115,9 +115,10 @@ def _run(
     draws = selected_draws(table, protocol, options.quick)
     guests = _guests(configs, table, options)
     contents = method_contents(configs, {draw.category for draw in draws}, guests)
+    depth = catalogue.depth(table.rules.depth)
     scenes: list[Scene] = []
     with progress("preparing", len(draws), "draws") as bar:
-        for scene in prepare_draws(table, folder, draws, captures):
+        for scene in prepare_draws(table, folder, draws, captures, depth):
             scenes.append(scene)
             bar.advance()
     jobs = cell_jobs(table, folder, protocol, configs, contents, scenes)

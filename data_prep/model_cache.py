@@ -13,14 +13,7 @@ from typing import Any, TypeVar
 
 import torch
 
-from extrap_train.config import (
-    AlikedMatcherConfig,
-    DepthConfig,
-    LoftrMatcherConfig,
-    Mast3rConfig,
-    MatcherConfig,
-    MonocularConfig,
-)
+from extrap_train.config import DepthConfig, MatcherConfig
 from extrap_train.data.paths import file_stamp
 from extrap_train.depth import DepthSource
 from extrap_train.depth.sources import depth_source, weight_files
@@ -67,9 +60,9 @@ class PrepModels:
     def default_workers(self) -> int:
         """One where a network runs on a GPU, whose memory more processes would overfill; else one
         per core."""
-        networks = (Mast3rConfig, MonocularConfig, LoftrMatcherConfig, AlikedMatcherConfig)
-        on_gpu = fastest_device().type == "cuda"
-        if on_gpu and any(isinstance(model, networks) for model in (self.depth, self.correction)):
+        models = (self.depth, self.correction)
+        has_network = any(getattr(model, "has_network", False) for model in models)
+        if has_network and fastest_device().type == "cuda":
             return 1
         return len(os.sched_getaffinity(0))
 

@@ -22,7 +22,13 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from extrap_train.command_line import CommandLine, explain
-from extrap_train.command_options import GROUPS, CommandOptions, choices_of, help_text
+from extrap_train.command_options import (
+    GROUPS,
+    CommandOptions,
+    choices_of,
+    help_text,
+    open_own_folders,
+)
 from extrap_train.config import TASKS, DataPrepConfig, TrainConfig, notes, validate
 from extrap_train.errors import InputError
 from extrap_train.exits import ends_in_one_line
@@ -70,9 +76,7 @@ def command(options: CommandOptions, run: Callable[[Any], Outcome | Path | None]
         elif {"-sc", "--shell-completion"} & set(line.flags):
             _complete(options, run)
         else:
-            for folder in line.own_folders:
-                if not Path(folder).is_dir():
-                    raise InputError(f"--config-dir {folder}: no such folder")
+            open_own_folders(line.own_folders)
             sys.argv[1:] = line.prepared(options)
             _compose(options, run)
 

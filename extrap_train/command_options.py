@@ -1,6 +1,8 @@
 """The options of a Hydra command, and its `--help`."""
 
 import difflib
+import os
+import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -10,6 +12,7 @@ from typing import Any
 
 from extrap_train import config as schema
 from extrap_train.config import MISSING, Option, options_of
+from extrap_train.errors import InputError
 
 GROUPS: dict[str, list[type]] = {
     "category": [schema.CategoryConfig],
@@ -19,11 +22,13 @@ GROUPS: dict[str, list[type]] = {
         schema.StereoConfig,
         schema.Mast3rConfig,
         schema.MonocularConfig,
+        schema.OwnDepthConfig,
     ],
     "matcher": [
         schema.FlowMatcherConfig,
         schema.LoftrMatcherConfig,
         schema.AlikedMatcherConfig,
+        schema.OwnMatcherConfig,
     ],
     "launcher": [schema.LocalConfig, schema.SlurmConfig],
     "model": [schema.ModelConfig],
@@ -89,6 +94,22 @@ def choices_of(group: str, own_folders: Sequence[str] = ()) -> list[str]:
     places = [Path(str(files("conf"))), *map(Path, own_folders)]
     found = ((place / group, file) for place in places for file in (place / group).rglob("*.yaml"))
     return sorted({file.relative_to(folder).with_suffix("").as_posix() for folder, file in found})
+
+
+def open_own_folders(names: Sequence[str]) -> list[str]:
+    """Absolute paths of the folders given with `--config-dir`; their modules can then be imported.
+
+    Worker processes import from them, too. InputError for one that is not there.
+    """
+    folders = [str(Path(name).resolve()) for name in names]
+    for name, folder in zip(names, folders, strict=True):
+        if not Path(folder).is_dir():
+            raise InputError(f"--config-dir {name}: no such folder")
+        sys.path.insert(0, folder)
+    if folders:
+        paths = [*folders, *filter(None, [os.environ.get("PYTHONPATH")])]
+        os.environ["PYTHONPATH"] = os.pathsep.join(paths)
+    return folders
 
 
 def suggest(given: str, known: Collection[str]) -> str:

@@ -16,6 +16,7 @@ _ORDER = (
     "extrap_train.store",
     "extrap_train.exits",
     "extrap_train.config",
+    "extrap_train.factories",
     "extrap_train.device",
     "extrap_train.geometry",
     "extrap_train.weight_files",

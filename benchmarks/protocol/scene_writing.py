@@ -2,7 +2,6 @@
 
 import hashlib
 import logging
-from collections.abc import Mapping
 from collections.abc import Sequence as ListOf
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from benchmarks.protocol.prepared_scene import (
     Scene,
     SceneRecord,
 )
-from extrap_train.config import DatasetDepthConfig, DepthConfig, RulesConfig, StereoConfig
+from extrap_train.config import DatasetDepthConfig, DepthConfig, RulesConfig
 from extrap_train.data.images import to_eight_bits
 from extrap_train.data.queries import query_batch
 from extrap_train.depth import NoDepthError
@@ -34,21 +33,24 @@ from extrap_train.views import Camera, View, stack_cameras
 
 LOG = logging.getLogger(__name__)
 
-DEPTHS: Mapping[str, DepthConfig] = {"dataset": DatasetDepthConfig(), "stereo": StereoConfig()}
-
 
 def prepare_scene(
-    folder: Path, capture: Capture, draw: Draw, rules: RulesConfig, origin: str
+    folder: Path,
+    capture: Capture,
+    draw: Draw,
+    rules: RulesConfig,
+    depth: DepthConfig,
+    origin: str,
 ) -> Scene:
     """Read a draw's frames and write its folder and its truth's, or open what is there.
 
-    `origin` names all that decides the content; what is of another origin, or lacks or has changed
-    a file, is replaced.
+    `depth` is the source that `rules.depth` names. `origin` names all that decides the content;
+    what is of another origin, or lacks or has changed a file, is replaced.
     """
     there = _whole_scene(folder, origin)
     if there is not None:
         return there
-    contents, record = _scene(capture, draw, rules, origin)
+    contents, record = _scene(capture, draw, rules, depth, origin)
     truth = Scene(folder, record).truth_folder
     for place, is_input in ((truth, False), (folder, True)):  # the record comes last
         with atomic_folder(place) as made:
@@ -71,7 +73,7 @@ def _whole_scene(folder: Path, origin: str) -> Scene | None:
 
 
 def _scene(
-    capture: Capture, draw: Draw, rules: RulesConfig, origin: str
+    capture: Capture, draw: Draw, rules: RulesConfig, depth: DepthConfig, origin: str
 ) -> tuple[dict[str, bytes], SceneRecord]:
     """A draw's files by name, and its record."""
     size = rules.image_size
@@ -83,7 +85,7 @@ def _scene(
         )
     photographs = [frames[name].load() for name in draw.inputs]
     fine_size = size * _fine_scale(photographs, rules)
-    inputs, seconds = _with_depth(photographs, rules.depth, fine_size)
+    inputs, seconds = _with_depth(photographs, depth, fine_size)
     targets = [frames[name].load().squared(size) for name in draw.targets]
     cameras = stack_cameras([view.camera for view in targets])
     depths = [view.depth for view in inputs if view.depth is not None]
@@ -131,26 +133,28 @@ def _fine_scale(photographs: ListOf[View], rules: RulesConfig) -> int:
     return max(1, min(rules.fine_scale, smallest // rules.image_size))
 
 
-def _with_depth(photographs: ListOf[View], depth_name: str, size: int) -> tuple[list[View], float]:
+def _with_depth(
+    photographs: ListOf[View], depth: DepthConfig, size: int
+) -> tuple[list[View], float]:
     """The inputs at a size with their depth, and how long finding it took.
 
     Depth is found at its source's own resolution, from the inputs alone. It is unknown everywhere,
     with a warning, where the inputs stand too far apart: not every method needs it.
     """
-    source = depth_source(DEPTHS[depth_name])
+    source = depth_source(depth)
     side = max(size, source.image_size or 0)
     large = [view.squared(side) for view in photographs]
     with Stopwatch() as watch:
         try:
-            found = [depth.reliable() for depth in source.depth_maps(large)]
+            found = [one.reliable() for one in source.depth_maps(large)]
         except NoDepthError as error:
             LOG.warning("%s", error)
             found = [torch.zeros_like(view.image[0]) for view in large]
     views = []
-    for view, depth in zip(large, found, strict=True):
-        posed = View(view.image, view.camera, depth, name=view.name)
+    for view, its_depth in zip(large, found, strict=True):
+        posed = View(view.image, view.camera, its_depth, name=view.name)
         views.append(posed.resized(size, size))
-    return views, 0.0 if depth_name == "dataset" else watch.seconds
+    return views, 0.0 if isinstance(depth, DatasetDepthConfig) else watch.seconds
 
 
 def _angles_to_nearest(inputs: ListOf[View], targets: ListOf[View]) -> list[float]:

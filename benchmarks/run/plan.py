@@ -19,9 +19,11 @@ from benchmarks.run.identity import (
     scores_manifest,
 )
 from benchmarks.run.method_content import MethodContent
-from extrap_train.config import MethodConfig, TableConfig
+from extrap_train.config import DepthConfig, MethodConfig, TableConfig
 from extrap_train.data.frame_files import sequence_folder
+from extrap_train.depth.sources import weight_files
 from extrap_train.errors import InputError
+from extrap_train.store.digests import file_digest
 
 
 @dataclass(frozen=True)
@@ -125,14 +127,20 @@ def _difference(frozen: Protocol, fresh: Protocol) -> str:
 
 
 def prepare_draws(
-    table: TableConfig, folder: TableFolder, draws: list[Draw], captures: list[Capture]
+    table: TableConfig,
+    folder: TableFolder,
+    draws: list[Draw],
+    captures: list[Capture],
+    depth: DepthConfig,
 ) -> Iterable[Scene]:
     """Every draw's folder, one after another, made where it is missing or of another origin."""
     by_name = {(c.sequence.category, c.sequence.name): c for c in captures}
+    files = [path for path in weight_files(depth) if path.is_file()]
+    found_by = [asdict(depth), *map(file_digest, files)]
     for draw in draws:
-        origin = scene_origin(asdict(table.captures), asdict(table.rules), asdict(draw))
+        origin = scene_origin(asdict(table.captures), asdict(table.rules), found_by, asdict(draw))
         capture = by_name[draw.category, draw.sequence]
-        yield prepare_scene(folder.scene(draw), capture, draw, table.rules, origin)
+        yield prepare_scene(folder.scene(draw), capture, draw, table.rules, depth, origin)
 
 
 def cell_jobs(

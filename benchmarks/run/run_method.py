@@ -2,21 +2,20 @@
 over as bytes, of which every entry is checked (`check_output`).
 """
 
-import importlib
 import json
 import os
 import random
 import traceback
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any
 
 import numpy as np
 import safetensors
 import safetensors.numpy
 import torch
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import TypeAdapter, ValidationError
 from torch import Tensor
 
 from benchmarks.methods.base import Method, SceneInputs, Stopwatch, Synthesis, Unavailable
@@ -31,9 +30,10 @@ from benchmarks.run.cells import (
     MethodOutput,
     one_line,
 )
-from extrap_train.config import MethodConfig, check_options
+from extrap_train.config import MethodConfig
 from extrap_train.data.images import to_eight_bits
-from extrap_train.errors import InputError, did_you_mean
+from extrap_train.errors import InputError
+from extrap_train.factories import make_object
 from extrap_train.jobs import Died
 from extrap_train.metrics import require_unit_range
 
@@ -68,26 +68,9 @@ def run_method(job: CellJob) -> bytes:
 
 
 def build_method(config: MethodConfig) -> Method:
-    """The object that `factory` names, with its options; raises InputError for what does not fit.
-
-    The file's own ImportError keeps its traceback only where the file itself is found.
-    """
-    module_name, _, name = config.factory.rpartition(".")
-    try:
-        factory = getattr(importlib.import_module(module_name), name)
-    except (ModuleNotFoundError, AttributeError, ValueError) as error:
-        raise InputError(
-            f"method {config.name}: factory {config.factory} cannot be imported ({error}); is its "
-            "folder given with --config-dir?"
-        ) from None
-    method = factory(**_typed_options(config, factory))
-    if not isinstance(method, Method):
-        raise InputError(
-            f"method {config.name}: {config.factory} has no weight_files() and synthesize(); see "
-            "benchmarks/methods/base.py"
-        )
-    if is_dataclass(method):
-        check_options(method, f"options.{config.name}.")
+    """The method with its options; raises InputError for what does not fit."""
+    name, prefix = f"method {config.name}", f"options.{config.name}."
+    method: Method = make_object(config.factory, config.options, name, Method, prefix)
     return method
 
 
@@ -97,23 +80,6 @@ def weight_paths(method: Method, category: str) -> list[Path]:
     if not isinstance(files, (list, tuple)) or not all(isinstance(f, (str, Path)) for f in files):
         raise TypeError(f"weight_files() returns paths, not {type(files).__name__}")
     return [Path(file) for file in files]
-
-
-def _typed_options(config: MethodConfig, factory: Any) -> dict[str, Any]:
-    """Options as the fields of a dataclass declare them; other classes have none."""
-    known = [f.name for f in fields(factory) if f.init] if is_dataclass(factory) else []
-    hints, values = get_type_hints(factory), {}
-    for name, value in config.options.items():
-        if name not in known:
-            hint = did_you_mean(name, known) if known else "it has none"
-            raise InputError(f"method {config.name}: there is no option {name}; {hint}")
-        kind = TypeAdapter(hints[name], config=ConfigDict(arbitrary_types_allowed=True))
-        try:
-            values[name] = kind.validate_json(json.dumps(value), strict=True)
-        except ValidationError as error:
-            reason = error.errors(include_url=False, include_input=False)[0]["msg"]
-            raise InputError(f"options.{config.name}.{name}={value}: {reason}") from None
-    return values
 
 
 def _packed(

@@ -36,6 +36,8 @@ from extrap_train.config.data_sources import (
     Mast3rConfig,
     MatcherConfig,
     MonocularConfig,
+    OwnDepthConfig,
+    OwnMatcherConfig,
     PrepConfig,
     StereoConfig,
     SyntheticConfig,

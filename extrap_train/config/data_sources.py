@@ -1,7 +1,7 @@
 """Where photographs, matches and depth come from, and what becomes training data."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from extrap_train.config.options import MISSING, option
 
@@ -134,6 +134,7 @@ class MatcherConfig:
     """How points of one picture are found in another; one subclass per matcher."""
 
     name: str = MISSING
+    has_network: ClassVar[bool] = True
 
 
 @dataclass
@@ -141,6 +142,7 @@ class FlowMatcherConfig(MatcherConfig):
     """Dense inverse search: a flow for every pixel, without any weights."""
 
     name: str = "flow"
+    has_network: ClassVar[bool] = False
     image_size: int = option(
         512,
         "longest side that is matched at; smaller pictures are enlarged up to twice",
@@ -182,10 +184,20 @@ class AlikedMatcherConfig(MatcherConfig):
 
 
 @dataclass
+class OwnMatcherConfig(MatcherConfig):
+    """A class with the protocol of `extrap_train/matching`, named by a YAML."""
+
+    name: str = "own"
+    factory: str = option(MISSING, "class of a matcher of your own, as package.module.Class")
+    options: dict[str, Any] = option({}, "values of the fields of that class")
+
+
+@dataclass
 class DepthConfig:
     """Where depth comes from; one subclass per source."""
 
     name: str = MISSING
+    has_network: ClassVar[bool] = True
 
 
 @dataclass
@@ -193,6 +205,7 @@ class DatasetDepthConfig(DepthConfig):
     """The depth that the data set brings."""
 
     name: str = "dataset"
+    has_network: ClassVar[bool] = False
 
 
 @dataclass
@@ -200,6 +213,7 @@ class StereoConfig(DepthConfig):
     """Plane-sweep multi-view stereo for known poses."""
 
     name: str = "stereo"
+    has_network: ClassVar[bool] = False
     planes: int = option(96, "depth hypotheses, evenly spaced in inverse depth", low=3, high=4096)
     neighbours: int = option(4, "other views that vote", low=1, high=64)
     image_size: int = option(
@@ -244,3 +258,12 @@ class MonocularConfig(DepthConfig):
     matcher: MatcherConfig = MISSING
     """matcher@depth.matcher=aliked chooses another."""
     neighbours: int = option(4, "most other views that a view is matched with", low=1, high=64)
+
+
+@dataclass
+class OwnDepthConfig(DepthConfig):
+    """A class with the protocol of `extrap_train/depth`, named by a YAML."""
+
+    name: str = "own"
+    factory: str = option(MISSING, "class of a depth source of your own, as package.module.Class")
+    options: dict[str, Any] = option({}, "values of the fields of that class")

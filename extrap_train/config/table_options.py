@@ -89,7 +89,7 @@ class RulesConfig:
         [0], "seeds of the draws and of the methods' own randomness", is_set=True, low=0, high=2**30
     )
     depth: str = option(
-        "dataset", "where the inputs' depth comes from", known=("dataset", "stereo")
+        "dataset", "where the inputs' depth comes from: a choice of depth= in the other commands"
     )
 
 

@@ -1,6 +1,7 @@
 """Depth behind one protocol: pairwise point maps with confidence, as a pairwise 3D model has them.
 
-A source is added with one file here and one YAML under `conf/depth/`.
+A source is added with one file (a class with the protocol `DepthSource`) and one YAML under
+`conf/depth/` that names the class as `factory`.
 """
 
 from collections.abc import Sequence

@@ -11,6 +11,8 @@ from extrap_train.config import (
     LoftrMatcherConfig,
     Mast3rConfig,
     MonocularConfig,
+    OwnDepthConfig,
+    OwnMatcherConfig,
     StereoConfig,
     required_file,
 )
@@ -22,6 +24,7 @@ from extrap_train.depth.monocular import MonocularDepth
 from extrap_train.depth.stereo import PlaneSweepStereo
 from extrap_train.device import fastest_device
 from extrap_train.errors import InputError
+from extrap_train.factories import files_of, make_object
 from extrap_train.matching.matchers import matcher
 
 
@@ -46,14 +49,18 @@ def depth_source(config: DepthConfig, device: torch.device | None = None) -> Dep
             network = read_depth_anything(config.model, device)
             found = matcher(config.matcher, "depth.matcher", device)
             return MonocularDepth(config, network, found)
-        case _:
-            raise InputError(
-                f"depth={config.name}: unknown; choose dataset, stereo, mast3r or monocular"
+        case OwnDepthConfig():
+            name, prefix = f"depth={config.name}", "depth.options."
+            own: DepthSource = make_object(
+                config.factory, config.options, name, DepthSource, prefix
             )
+            return own
+        case _:
+            raise InputError(f"depth={config.name}: is no depth source that this project knows")
 
 
 def weight_files(options: object) -> list[Path]:
-    """The files of weights that a depth source or a matcher reads."""
+    """The files that decide what a source or a matcher says: weights, and code of your own."""
     match options:
         case Mast3rConfig() | LoftrMatcherConfig() | AlikedMatcherConfig():
             return [Path(options.checkpoint or "")]
@@ -61,5 +68,7 @@ def weight_files(options: object) -> list[Path]:
             from extrap_train.depth.depth_anything import files_read
 
             return [*files_read(options.model), *weight_files(options.matcher)]
+        case OwnDepthConfig() | OwnMatcherConfig():
+            return files_of(options.factory, options.options)
         case _:
             return []

@@ -1,8 +1,8 @@
 """Matchers behind one protocol: which points of two pictures show the same thing.
 
-A matcher is added with one file here and one YAML under `conf/matcher/`. Pixels are (u, v) with
-centres at +0.5, as everywhere; a flow says where a pixel of the *first* picture went in the
-*second*.
+A matcher is added with one file (a class with the protocol `Matcher`) and one YAML under
+`conf/matcher/` that names the class as `factory`. Pixels are (u, v) with centres at +0.5, as
+everywhere; a flow says where a pixel of the *first* picture went in the *second*.
 """
 
 from dataclasses import dataclass

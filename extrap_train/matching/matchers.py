@@ -9,10 +9,12 @@ from extrap_train.config import (
     FlowMatcherConfig,
     LoftrMatcherConfig,
     MatcherConfig,
+    OwnMatcherConfig,
     required_file,
 )
 from extrap_train.device import fastest_device
 from extrap_train.errors import InputError
+from extrap_train.factories import make_object
 from extrap_train.matching import Matcher
 from extrap_train.matching.dense_flow import FlowMatcher
 
@@ -40,8 +42,12 @@ def matcher(
 
             aliked = read_aliked(_weights(config, option), config, f"{option}.checkpoint")
             return AlikedMatcher(config, aliked.to(device))
+        case OwnMatcherConfig():
+            name, prefix = f"{option}={config.name}", f"{option}.options."
+            own: Matcher = make_object(config.factory, config.options, name, Matcher, prefix)
+            return own
         case _:
-            raise InputError(f"{option}={config.name}: unknown; choose flow, loftr or aliked")
+            raise InputError(f"{option}={config.name}: is no matcher that this project knows")
 
 
 def _weights(config: LoftrMatcherConfig | AlikedMatcherConfig, option: str) -> Path:

@@ -10,7 +10,13 @@ from benchmarks.protocol.captures import Capture
 from benchmarks.protocol.draws import Draw, Protocol, draw_sequence
 from benchmarks.run.plan import TableFolder, open_protocol, prepare_draws, selected_draws
 from benchmarks.run.run_method import build_method
-from extrap_train.config import CapturesConfig, QuickConfig, RulesConfig, TableConfig
+from extrap_train.config import (
+    CapturesConfig,
+    DatasetDepthConfig,
+    QuickConfig,
+    RulesConfig,
+    TableConfig,
+)
 from extrap_train.errors import InputError
 from extrap_train.views import stack_poses
 from tests.benchmarks.analytic import analytic_capture
@@ -34,7 +40,7 @@ def test_a_captures_name_leads_out_of_no_folder(tmp_path: Path) -> None:
     names = ["../../../escape", "../../../../escape", ".._.._.._escape", "/escape", "a/b", "a_b"]
     captures = [Capture(analytic_capture(9, 24, name)) for name in names]
     draws = [_draw(capture) for capture in captures]
-    scenes = list(prepare_draws(_TABLE, folder, draws, captures))
+    scenes = list(prepare_draws(_TABLE, folder, draws, captures, DatasetDepthConfig()))
     assert {scene.folder.parent for scene in scenes} == {folder.scenes}
     assert len({scene.folder for scene in scenes}) == len(names)
     assert [scene.draw for scene in scenes] == draws

@@ -11,7 +11,7 @@ from benchmarks.protocol.captures import Capture
 from benchmarks.protocol.draws import Draw, draw_sequence
 from benchmarks.protocol.prepared_scene import Scene, truths_removed
 from benchmarks.protocol.scene_writing import prepare_scene
-from extrap_train.config import RulesConfig
+from extrap_train.config import DatasetDepthConfig, RulesConfig
 from extrap_train.errors import InputError
 from extrap_train.metrics import psnr
 from tests.benchmarks.analytic import analytic_capture
@@ -19,12 +19,16 @@ from tests.benchmarks.analytic import analytic_capture
 _RULES = RulesConfig(image_size=32, pool=9)
 
 
+def _prepare(folder: Path, capture: Capture, draw: Draw, rules: RulesConfig, origin: str) -> Scene:
+    return prepare_scene(folder, capture, draw, rules, DatasetDepthConfig(), origin)
+
+
 @pytest.fixture(scope="module")
 def draw_and_scene(tmp_path_factory: pytest.TempPathFactory) -> tuple[Draw, Scene]:
     capture = Capture(analytic_capture(size=64))
     draw = draw_sequence("apple", "one", *_frames(capture.sequence), _RULES)[0]
     folder = tmp_path_factory.mktemp("table") / "scenes" / draw.label
-    return draw, prepare_scene(folder, capture, draw, _RULES, "origin")
+    return draw, _prepare(folder, capture, draw, _RULES, "origin")
 
 
 def _frames(capture):
@@ -78,14 +82,14 @@ def test_what_is_there_is_used_and_what_was_touched_made_anew(
     draw, scene = draw_and_scene
     capture, folder = Capture(analytic_capture(size=64)), scene.folder
     before = (folder / "scene.json").stat().st_ino
-    assert prepare_scene(folder, capture, draw, _RULES, "origin").data_hash == scene.data_hash
+    assert _prepare(folder, capture, draw, _RULES, "origin").data_hash == scene.data_hash
     assert (folder / "scene.json").stat().st_ino == before
     np.save(folder / "inputs" / "depth.npy", np.zeros((3, 64, 64), np.float32))
     assert scene.changed_files() == ["inputs/depth.npy"]
-    again = prepare_scene(folder, capture, draw, _RULES, "origin")
+    again = _prepare(folder, capture, draw, _RULES, "origin")
     assert again.data_hash == scene.data_hash
     assert not again.changed_files()
-    assert prepare_scene(folder, capture, draw, _RULES, "other").record.origin == "other"
+    assert _prepare(folder, capture, draw, _RULES, "other").record.origin == "other"
 
 
 @pytest.mark.parametrize("damaged", ['{"form', '{"format": 2}', "[]"])
@@ -94,14 +98,14 @@ def test_a_damaged_record_is_no_scene_and_made_anew(
 ) -> None:
     draw, scene = draw_and_scene
     (scene.folder / "scene.json").write_text(damaged)
-    again = prepare_scene(scene.folder, Capture(analytic_capture(size=64)), draw, _RULES, "origin")
+    again = _prepare(scene.folder, Capture(analytic_capture(size=64)), draw, _RULES, "origin")
     assert again.data_hash == scene.data_hash
 
 
 def test_a_frame_that_the_capture_lacks_is_named(tmp_path: Path) -> None:
     draw = Draw("apple", "one", 1, "random", 0, ("nowhere.png",), ("000.png",))
     with pytest.raises(InputError, match=r"has no frame nowhere\.png"):
-        prepare_scene(tmp_path / "scenes" / "one", Capture(analytic_capture()), draw, _RULES, "")
+        _prepare(tmp_path / "scenes" / "one", Capture(analytic_capture()), draw, _RULES, "")
     assert not list(tmp_path.iterdir())
 
 
@@ -119,7 +123,7 @@ def test_small_photographs_are_not_scaled_up(
 ) -> None:
     draw = draw_and_scene[0]
     small = Capture(analytic_capture(size=32))
-    inputs = prepare_scene(tmp_path / "scenes" / "small", small, draw, _RULES, "").inputs()
+    inputs = _prepare(tmp_path / "scenes" / "small", small, draw, _RULES, "").inputs()
     for fine, view in zip(inputs.fine_views, inputs.views, strict=True):
         assert torch.equal(fine.image, view.image)
 
@@ -130,7 +134,7 @@ def test_masks_of_the_finer_copy_hold_what_the_coarse_ones_reach(
     """A surface that a coarse warp reaches is reached by a finer one; not the other way round."""
     draw, scene = draw_and_scene
     capture, coarse = Capture(analytic_capture(size=64)), replace(_RULES, fine_scale=1)
-    before = prepare_scene(tmp_path / "scenes" / "coarse", capture, draw, coarse, "").truth().masks
+    before = _prepare(tmp_path / "scenes" / "coarse", capture, draw, coarse, "").truth().masks
     now = scene.truth().masks
     assert (now >= before).float().mean() > 0.99
     assert now.mean() > before.mean()
