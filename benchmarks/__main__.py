@@ -52,7 +52,9 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="benchmark", description=__doc__)
-    parser.add_argument("--version", action="version", version=version("extrap-train"))
+    parser.add_argument(
+        "--version", action="version", version=f"extrap-train {version('extrap-train')}"
+    )
     commands = parser.add_subparsers(dest="command", required=True)
 
     def command(

@@ -254,7 +254,7 @@ def test_the_version_is_the_packages(capsys: pytest.CaptureFixture[str]) -> None
     with pytest.raises(SystemExit) as ended:
         main(["--version"])
     assert ended.value.code == 0
-    assert capsys.readouterr().out.strip() == version("extrap-train")
+    assert capsys.readouterr().out == f"extrap-train {version('extrap-train')}\n"
 
 
 def _results(output: Path) -> Results:
