@@ -7,7 +7,7 @@ import mmap
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,8 @@ class ModelCamera:
     height: int
     width: int
     parameters: tuple[float, ...]
+    fault: str = ""
+    """What is wrong with its entry, which then says nothing else."""
 
 
 @dataclass(frozen=True)
@@ -40,15 +42,17 @@ class ModelImage:
     camera: int
     quaternion_wxyz: tuple[float, ...]
     translation: tuple[float, ...]
+    fault: str = ""
+    """What is wrong with its entry, which then says nothing but the name, if that."""
 
 
 def read_model_cameras(file: Path) -> dict[int, ModelCamera]:
     """Every camera of a `cameras.bin` or `cameras.txt`, by its number."""
     found: dict[int, ModelCamera] = {}
     for camera in _binary_cameras(file) if file.suffix == ".bin" else _text_cameras(file):
-        if camera.number in found:
-            raise InputError(f"{file}: lists camera {camera.number} twice; export the model again")
-        found[camera.number] = camera
+        if found.setdefault(camera.number, camera) != camera:
+            fault = f"{file}: lists camera {camera.number} twice; export the model again"
+            found[camera.number] = replace(camera, fault=fault)
     return found
 
 
@@ -72,7 +76,7 @@ class _Cursor:
         end = self.content.find(b"\0", self.at, self.at + MAX_PATH_BYTES + 1)
         if end < 0:
             raise struct.error("a name has no end")
-        name = self.content[self.at : end].decode()
+        name = self.content[self.at : end].decode(errors="surrogateescape")
         self.at = end + 1
         return name
 
@@ -90,10 +94,6 @@ def _cursor(file: Path) -> Iterator[_Cursor]:
                 raise struct.error("the last image's points are missing")
     except InputError:
         raise
-    except UnicodeDecodeError:
-        raise InputError(
-            f"{file}: has a picture name that is not UTF-8; export the model again"
-        ) from None
     except (struct.error, ValueError, OverflowError):  # ValueError: an empty file
         raise InputError(f"{file}: is truncated or damaged; export the model again") from None
     except OSError as error:
@@ -133,12 +133,17 @@ def _text_cameras(file: Path) -> list[ModelCamera]:
     for number, line in _lines(file):
         if not line.strip():
             continue
+        fields = line.split()
         try:
-            identity, model, width, height, *parameters = line.split()
-            numbers = tuple(map(float, parameters))
-            cameras.append(ModelCamera(int(identity), model, int(height), int(width), numbers))
+            identity = int(fields[0])
         except ValueError:
-            raise _malformed_error(file, number) from None
+            raise InputError(_malformed(file, number)) from None
+        try:
+            model, width, height, *parameters = fields[1:]
+            numbers = tuple(map(float, parameters))
+            cameras.append(ModelCamera(identity, model, int(height), int(width), numbers))
+        except ValueError:
+            cameras.append(ModelCamera(identity, "", 0, 0, (), _malformed(file, number)))
     return cameras
 
 
@@ -158,13 +163,14 @@ def _text_images(file: Path) -> list[ModelImage]:
         elif not fields:  # allowed before the first image and after the last
             blank_at = number if images else 0
         elif blank_at:
-            raise _malformed_error(file, blank_at)
+            raise InputError(_malformed(file, blank_at))
         else:
             try:
                 pose = tuple(map(float, fields[1:8]))
                 images.append(ModelImage(fields[9].strip(), int(fields[8]), pose[:4], pose[4:]))
             except (IndexError, ValueError):
-                raise _malformed_error(file, number) from None
+                name = fields[9].strip() if len(fields) == 10 else ""
+                images.append(ModelImage(name, 0, (), (), _malformed(file, number)))
             is_image = False
     return images
 
@@ -182,18 +188,16 @@ def _lines(file: Path) -> Iterator[tuple[int, str]]:
     """Numbered lines without the comments, one at a time."""
     number = 0
     try:
-        with file.open(encoding="utf-8-sig") as stream:
+        with file.open(encoding="utf-8-sig", errors="surrogateescape") as stream:
             while line := stream.readline(_MAX_LINE_CHARACTERS):
                 number += 1
                 if len(line) == _MAX_LINE_CHARACTERS:
                     raise InputError(f"{file}: line {number} has no end; export the model again")
                 if not line.startswith("#"):
                     yield number, line
-    except UnicodeDecodeError:
-        raise InputError(f"{file}: is no UTF-8 text; export the model again") from None
     except OSError as error:
         raise InputError(f"{file}: cannot be read ({error.strerror}); check the file") from None
 
 
-def _malformed_error(file: Path, number: int) -> InputError:
-    return InputError(f"{file}: line {number} is malformed; export the model again")
+def _malformed(file: Path, number: int) -> str:
+    return f"{file}: line {number} is malformed; export the model again"

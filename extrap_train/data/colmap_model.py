@@ -77,16 +77,17 @@ def read_model(model: Path, images: Path, name: str) -> FrameSequence:
     cameras, entries = read_model_cameras(cameras_file), read_model_images(images_file)
     if not entries:
         raise InputError(f"{images_file}: lists no picture; run COLMAP again")
-    listed = [
-        Listed(
-            check_relative(entry.name, images_file),
-            partial(_photograph, entry, cameras, cameras_file),
-        )
-        for entry in entries
-    ]
+    listed, unusable = [], []
+    for entry in entries:
+        try:
+            path = check_relative(entry.name, images_file)
+        except InputError as error:
+            unusable.append(entry.fault or str(error))
+        else:
+            listed.append(Listed(path, partial(_photograph, entry, cameras, cameras_file)))
     cloud = PointCloud(model, POINT_CLOUD)
     return sequence_of_photographs(
-        ListedFiles(images), name, listed, images_file, COLMAP_POSES, point_cloud=cloud
+        ListedFiles(images), name, listed, images_file, COLMAP_POSES, unusable, cloud
     )
 
 
@@ -108,6 +109,8 @@ def _count_images(model: Path) -> int:
 def _photograph(
     entry: ModelImage, cameras: dict[int, ModelCamera], file: Path, path: str
 ) -> Photograph:
+    if entry.fault:
+        raise InputError(f"{entry.name}: {entry.fault}")
     if entry.camera not in cameras:
         raise InputError(
             f"{file}: {entry.name} names camera {entry.camera}, which the model does not have; "
@@ -127,6 +130,8 @@ def _photograph(
 
 def _lens(camera: ModelCamera, file: Path) -> Lens:
     """InputError where the model cannot be undone or the entry makes no sense."""
+    if camera.fault:
+        raise InputError(camera.fault)
     model = next((model for model in CAMERA_MODELS if model.name == camera.model), None)
     if model is None:
         raise InputError(

@@ -5,6 +5,7 @@ Keys that are neither in the tables below nor asked for here do not change what 
 are passed over.
 """
 
+import json
 import math
 from typing import Any
 
@@ -73,7 +74,7 @@ def lens_of(entry: dict[str, Any], height: int, width: int) -> Lens:
     known = [length for length in focal if length is not None]
     if not known:
         raise KeyError("fl_x")
-    center = _number(entry, "cx", width / 2), _number(entry, "cy", height / 2)
+    center = number_of(entry, "cx", width / 2), number_of(entry, "cy", height / 2)
     return _lens_with_distortion(
         entry, {"fx": known[0], "fy": known[-1], "cx": center[0], "cy": center[1]}
     )
@@ -95,10 +96,10 @@ def _lens_with_distortion(entry: dict[str, Any], pinhole: dict[str, float]) -> L
 def _focal(entry: dict[str, Any], axis: str, side: int) -> float | None:
     """In pixels; None where nothing is said of this axis."""
     if f"fl_{axis}" in entry:
-        return _number(entry, f"fl_{axis}")
+        return number_of(entry, f"fl_{axis}")
     for key, unit in ((f"{axis}_fov", math.pi / 180), (f"camera_angle_{axis}", 1.0)):
         if key in entry:
-            angle_rad = _number(entry, key) * unit
+            angle_rad = number_of(entry, key) * unit
             if not 0 < angle_rad < math.pi:
                 raise ValueError(
                     f"{key} is {entry[key]!r}, no field of view (camera_angle_x and _y are in "
@@ -109,14 +110,14 @@ def _focal(entry: dict[str, Any], axis: str, side: int) -> float | None:
 
 
 def _coefficients(entry: dict[str, Any]) -> dict[str, float]:
-    found = {key: _number(entry, key) for key in _COEFFICIENTS if key in entry}
+    found = {key: number_of(entry, key) for key in _COEFFICIENTS if key in entry}
     listed = entry.get("distortion_params")
     if not _says_something(listed):
         return found
     if not isinstance(listed, list) or len(listed) not in (4, len(_PARAMS)):
         raise ValueError(f"distortion_params {listed!r:.60} are not {', '.join(_PARAMS)}")
     from_list = {
-        key: _number({"distortion_params": value}, "distortion_params")
+        key: number_of({"distortion_params": value}, "distortion_params")
         for key, value in zip(_PARAMS, listed, strict=False)
     }
     if found and any(found.get(key, 0.0) != value for key, value in from_list.items()):
@@ -149,11 +150,15 @@ def _says_something(value: Any) -> bool:
     return bool(value)
 
 
-def _number(entry: dict[str, Any], key: str, default: float | None = None) -> float:
-    value: Any = entry.get(key, default)
+def number_of(entry: dict[str, Any], key: str, default: float | None = None) -> float:
+    """The number of a key; ValueError that names the key where it is none.
+
+    Raises KeyError where there is neither the key nor a default.
+    """
+    value: Any = entry[key] if default is None else entry.get(key, default)
     try:
         if isinstance(value, bool):
             raise TypeError
         return float(value)
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{key} is {value!r:.60}, no number") from None
+        raise ValueError(f"{key} is {json.dumps(value)[:60]}, no number") from None

@@ -144,24 +144,27 @@ def sequence_of_photographs(
     listed: Sequence[Listed],
     description: Path,
     convention: PoseConvention,
+    unusable: Sequence[str] = (),
     point_cloud: PointCloud | None = None,
 ) -> FrameSequence:
     """A sequence of the photographs below `files.root`, in the order of their paths.
 
-    `description` is the file that lists them. Entries without a picture, and those that cannot be
-    used, are left out with one warning each kind. Raises InputError where a picture is listed
-    twice, none is left, or the cameras can see nothing in common.
+    `description` is the file that lists them; `unusable` says of more of its entries why they name
+    no picture. Entries without a picture, and those that cannot be used or contradict each other,
+    are left out with one warning each kind. Raises InputError where none is left, or the cameras
+    can see nothing in common.
     """
-    if len(listed) > MAX_FRAMES:
+    count = len(listed) + len(unusable)
+    if count > MAX_FRAMES:
         raise InputError(f"{description}: lists more than {MAX_FRAMES:,} pictures; split it")
-    entries = _find_pictures(files, listed, description)
-    names = _frame_names([_name_path(path, entry) for path, entry in entries])
-    frames, left_out, resized = [], [], []
-    for (path, entry), frame_name in zip(entries, names, strict=True):
-        if entry is None:
+    pictures = _find_pictures(files, listed, description)
+    names = _frame_names([_name_path(path, entries) for path, entries in pictures])
+    frames, left_out, resized = [], [*unusable], []
+    for (path, entries), frame_name in zip(pictures, names, strict=True):
+        if not entries:
             continue
         try:
-            annotated = entry.describe(path)
+            annotated = _describe(path, entries, description)
             photo = _at_its_size(files.root, annotated)
             frames.append(_frame(files.root, photo, frame_name, description))
         except InputError as error:
@@ -172,7 +175,7 @@ def sequence_of_photographs(
     if not frames:
         raise InputError(left_out[0])
     if left_out:
-        log.warning("%d of %d frames are left out: %s", len(left_out), len(listed), left_out[0])
+        log.warning("%d of %d frames are left out: %s", len(left_out), count, left_out[0])
     if resized:
         say = "%s: %d pictures have another size than it says: their lenses are scaled (%s)"
         log.warning(say, description, len(resized), resized[0])
@@ -190,38 +193,51 @@ def sequence_of_photographs(
 
 def _find_pictures(
     files: ListedFiles, listed: Sequence[Listed], description: Path
-) -> list[tuple[str, Listed | None]]:
-    """The entries by the paths of their pictures, in order; None for one whose picture is missing.
+) -> list[tuple[str, list[Listed]]]:
+    """The pictures' paths in order, each with its entries: none where the picture is missing.
 
-    Warns of these; InputError where there is no picture at all, or one is listed twice.
+    Warns of these and of pictures listed twice; InputError where there is no picture at all.
     """
-    entries: list[tuple[str, Listed | None]] = []
-    missing, seen = [], set()
+    entries: dict[str, list[Listed]] = {}
+    missing = []
     for entry in listed:
         path = files.find(entry.path, PICTURE_SUFFIXES)
         if path is None:
             missing.append(entry.path)
-            entries.append((_normal(entry.path), None))
-        elif path in seen:
-            raise InputError(f"{description}: lists {path} twice; remove the second entry")
+            entries.setdefault(_normal(entry.path), [])
         else:
-            seen.add(path)
-            entries.append((path, entry))
+            entries.setdefault(path, []).append(entry)
+    found = [path for path, same in entries.items() if same]
     if missing:
-        count = "none" if not seen else f"only {len(seen)}"
+        count = f"only {len(found)}" if found else "none"
         fault = (
-            f"{description}: {count} of the {len(listed)} pictures it lists is in {files.root} "
+            f"{description}: {count} of the {len(entries)} pictures it lists is in {files.root} "
             f"({files.explain(missing[0])})"
         )
-        if not seen:
+        if not found:
             raise InputError(f"{fault}; put the pictures there")
         log.warning("%s", fault)
-    return sorted(entries, key=lambda entry: entry[0])
+    if twice := [path for path in found if len(entries[path]) > 1]:
+        log.warning("%s: lists %d pictures twice (%s)", description, len(twice), twice[0])
+    return sorted(entries.items())
 
 
-def _name_path(path: str, entry: Listed | None) -> str:
+def _describe(path: str, entries: Sequence[Listed], description: Path) -> Photograph:
+    """The photograph that all entries of one picture describe; InputError where they disagree."""
+    first, *others = [entry.describe(path) for entry in entries]
+    for other in others:
+        is_same_pose = torch.equal(first.world_to_cam, other.world_to_cam)
+        if not is_same_pose or first != replace(other, world_to_cam=first.world_to_cam):
+            raise InputError(
+                f"{description}: lists {path} twice, with different cameras or files; remove the "
+                "wrong entry"
+            )
+    return first
+
+
+def _name_path(path: str, entries: Sequence[Listed]) -> str:
     """The path that a frame is named by: its file's, but for case, which the description's has."""
-    listed = _normal(entry.path) if entry else path
+    listed = _normal(entries[0].path) if entries else path
     return listed if listed.casefold() == path.casefold() else path
 
 

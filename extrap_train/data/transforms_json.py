@@ -1,5 +1,6 @@
 """Folders with a `transforms.json`, as nerfstudio and instant-ngp write them (OpenGL axes)."""
 
+import json
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from extrap_train.data.camera_check import OPENGL_POSES
 from extrap_train.data.json_files import read_json, require_dict, require_list
-from extrap_train.data.lens_keys import LENS_KEYS, lens_of, merge_entry
+from extrap_train.data.lens_keys import LENS_KEYS, lens_of, merge_entry, number_of
 from extrap_train.data.listed_files import ListedFiles
 from extrap_train.data.paths import check_relative
 from extrap_train.data.photographs import (
@@ -43,14 +44,17 @@ def read_transforms(folder: Path) -> FrameSequence:
 
     Size, intrinsics and distortion may stand for a frame alone or for all. The world is the file's,
     whatever `applied_transform` led to it; nerfstudio's depth is scaled along with `applied_scale`.
-    Entries without a picture, and those with a camera that cannot be used, are left out.
+    Entries without a path or a picture, and those with a camera that cannot be used, are left out.
     """
     file = folder / TRANSFORMS
     files = ListedFiles(folder)
     content, entries = _read_entries(file)
-    listed = [
-        _listed_picture(files, content, entry, index, file) for index, entry in enumerate(entries)
-    ]
+    listed, unusable = [], []
+    for index, entry in enumerate(entries):
+        try:
+            listed.append(_listed_picture(files, content, entry, index, file))
+        except InputError as error:
+            unusable.append(str(error))
     cloud = content.get("ply_file_path")
     return sequence_of_photographs(
         files,
@@ -58,6 +62,7 @@ def read_transforms(folder: Path) -> FrameSequence:
         listed,
         file,
         OPENGL_POSES,
+        unusable,
         point_cloud=PointCloud(folder, check_relative(str(cloud), file)) if cloud else None,
     )
 
@@ -73,7 +78,8 @@ def read_cameras(file: Path) -> tuple[list[str], Camera]:
     names, cameras = [], []
     for index, entry in enumerate(entries):
         entry = merge_entry(content, require_dict(entry, f"an object as frame {index}", file))
-        name = check_relative(str(entry.get("file_path", f"{index:03d}")), file)
+        path = entry.get("file_path")
+        name = f"{index:03d}" if path is None else check_relative(str(path), file)
         if "w" not in entry or "h" not in entry:
             raise InputError(f"{file}: neither the file nor its entry {name} has w and h; add them")
         names.append(name)
@@ -132,19 +138,19 @@ def _photograph(files: ListedFiles, entry: dict[str, Any], file: Path, path: str
 def _size(picture: Path, entry: dict[str, Any]) -> tuple[int, int]:
     if "h" not in entry and "w" not in entry:
         return image_size(picture)
-    height, width = int(entry["h"]), int(entry["w"])
-    if height <= 0 or width <= 0 or height * width > MAX_PIXELS:
-        raise ValueError(f"image size {height} x {width}")
-    return height, width
+    height, width = number_of(entry, "h"), number_of(entry, "w")
+    if not (height >= 1 and width >= 1 and height * width <= MAX_PIXELS):
+        raise ValueError(f"image size {height:g} x {width:g}")
+    return int(height), int(width)
 
 
 def _depth(files: ListedFiles, entry: dict[str, Any]) -> DepthFile | None:
     """nerfstudio's files are in millimetres by default; instant-ngp's state their unit."""
     if path := entry.get("depth_file_path"):
-        unit = float(entry.get("depth_unit_scale_factor", MILLIMETRES))
-        unit *= float(entry.get("applied_scale", 1.0))
+        unit = number_of(entry, "depth_unit_scale_factor", MILLIMETRES)
+        unit *= number_of(entry, "applied_scale", 1.0)
     elif path := entry.get("depth_path"):
-        unit = float(entry["integer_depth_scale"])
+        unit = number_of(entry, "integer_depth_scale")
     else:
         return None
     return DepthFile(_find_or_keep(files, path), unit)
@@ -157,7 +163,11 @@ def _find_or_keep(files: ListedFiles, path: Any) -> str:
 
 def _rigid(rows: Any) -> Float[Tensor, "4 4"]:
     """A matrix of a file, without the scale that its last row or its axes may have."""
-    matrix = torch.tensor(rows, dtype=torch.float64)
+    try:
+        matrix = torch.tensor(rows, dtype=torch.float64)
+    except (TypeError, ValueError, OverflowError, RuntimeError):
+        said = json.dumps(rows)[:60]
+        raise ValueError(f"transform_matrix is {said}, expected 4 x 4 numbers") from None
     if matrix.shape not in ((4, 4), (3, 4)):
         raise ValueError(f"transform_matrix has shape {tuple(matrix.shape)}, expected 4 x 4")
     if len(matrix) == 4:

@@ -17,8 +17,8 @@ from typing import Any
 
 import pytest
 from captures import view_at, write_capture
+from posed_folders import write_transforms
 from test_colmap_model import Entry, write_binary, write_text
-from test_transforms_json import write_transforms
 
 from extrap_train.data.co3d import read_category
 from extrap_train.data.co3d.set_lists import read_sequence_split

@@ -1,7 +1,7 @@
 import pytest
 from captures import view_at, write_capture
+from posed_folders import write_transforms
 from test_colmap_model import Entry, write_binary
-from test_transforms_json import write_transforms
 
 from extrap_train.data.scene_spec import open_scene
 from extrap_train.errors import InputError

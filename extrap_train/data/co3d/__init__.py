@@ -7,20 +7,21 @@ one category. Depth is z in PyTorch3D's units, which are ours.
 import gc
 import logging
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 
 from extrap_train.data.co3d.annotations import (
+    BadEntry,
     FrameAnnotation,
     SequenceAnnotation,
     read_frame_annotations,
     read_sequence_annotations,
 )
 from extrap_train.data.co3d.frame_columns import Co3dFrames, is_blackened
-from extrap_train.data.sequences import FrameSequence, PointCloud
+from extrap_train.data.sequences import Frame, FrameSequence, PointCloud
 from extrap_train.errors import InputError, did_you_mean
 
 FRAME_ANNOTATIONS = "frame_annotations.jgz"
@@ -50,7 +51,8 @@ def require_category(root: Path, category: str) -> None:
 def read_category(root: Path, category: str) -> list[FrameSequence]:
     """All sequences of a category, by name; frames by number, those without a camera left out.
 
-    So are those whose camera is degenerate, and the sequences say so; InputError where all are.
+    So are those whose entry cannot be read or contradicts another, or whose camera is degenerate,
+    and the sequences say so; InputError where all are.
     """
     require_category(root, category)
     file = root / category / FRAME_ANNOTATIONS
@@ -61,7 +63,7 @@ def read_category(root: Path, category: str) -> list[FrameSequence]:
             # Popped: its parts go as soon as the sequence is made.
             _sequence(root, category, name, posed.pop(name), details.get(name), file)
             for name in sorted(posed)
-            if posed[name].parts
+            if posed[name].parts or posed[name].left_out
         ]
 
 
@@ -83,21 +85,21 @@ class _Posed:
 
     parts: list[Co3dFrames] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
-    """Why each of the others is: their camera is degenerate."""
+    """Why each of the others is: their entry or camera makes no sense."""
     blackened: int = 0
     """Hidden targets of the challenge, which are left out as known and not as damage."""
 
 
 def _group_posed_frames(root: Path, file: Path) -> dict[str, _Posed]:
     """The frames that have a camera; a sequence's entries need not stand together."""
-    posed: dict[str, _Posed] = defaultdict(_Posed)
+    posed: dict[str | None, _Posed] = defaultdict(_Posed)
     entries, count = read_frame_annotations(file), 0
     while taken := _take(islice(entries, _ENTRIES_AT_A_TIME), posed, root, file):
         count += taken
     sound = sum(len(part) for sequence in posed.values() for part in sequence.parts)
-    degenerate = [reason for sequence in posed.values() for reason in sequence.left_out]
+    unusable = [reason for sequence in posed.values() for reason in sequence.left_out]
     blackened = sum(sequence.blackened for sequence in posed.values())
-    without_camera = count - sound - len(degenerate) - blackened
+    without_camera = count - sound - len(unusable) - blackened
     if without_camera:
         log.warning("%s: %d frames have no camera and are left out", file, without_camera)
     if blackened:
@@ -106,21 +108,30 @@ def _group_posed_frames(root: Path, file: Path) -> dict[str, _Posed]:
         raise InputError(f"{file}: no frame has a camera; choose another category")
     if not sound:
         which = f"none of the {count} frames of {file.parent.name} can be used"
-        why = f"the first because of {degenerate[0]}" if degenerate else "all of them are black"
+        why = f"the first because of {unusable[0]}" if unusable else "all of them are black"
         raise InputError(f"{which}, {why}; choose another category")
-    if degenerate:
-        log.warning("%d frames are left out, the first: %s", len(degenerate), degenerate[0])
-    return posed
+    if unusable:
+        log.warning("%d frames are left out, the first: %s", len(unusable), unusable[0])
+    return {name: sequence for name, sequence in posed.items() if name is not None}
 
 
 def _take(
-    entries: Iterator[FrameAnnotation], posed: dict[str, _Posed], root: Path, file: Path
+    entries: Iterator[FrameAnnotation | BadEntry],
+    posed: dict[str | None, _Posed],
+    root: Path,
+    file: Path,
 ) -> int:
-    """Add the entries that have a camera to `posed`, as columns; returns how many there were."""
+    """Add the entries that have a camera to `posed`, as columns; returns how many there were.
+
+    Those of which not even the sequence can be read are None's.
+    """
     by_sequence: dict[str, list[FrameAnnotation]] = defaultdict(list)
     count = 0
     for annotation in entries:
         count += 1
+        if isinstance(annotation, BadEntry):
+            posed[annotation.sequence].left_out.append(annotation.reason)
+            continue
         if annotation.viewpoint is None:
             continue
         if is_blackened(root, annotation):
@@ -155,15 +166,21 @@ def _sequence(
     details: SequenceAnnotation | None,
     file: Path,
 ) -> FrameSequence:
-    frames = Co3dFrames.join(posed.parts)
-    if frames.has_duplicates:
-        raise InputError(f"{file}: sequence {name} lists an image twice; remove the second entry")
+    frames: Sequence[Frame] = ()
+    left_out = list(posed.left_out)
+    if posed.parts:
+        joined = Co3dFrames.join(posed.parts)
+        frames, contradictory = joined.without_duplicates(file)
+        left_out += contradictory
+        if doubled := len(joined) - len(frames):
+            which = contradictory[0] if contradictory else "whose entries agree"
+            log.warning("%s: %d entries of %s list an image again, %s", file, doubled, name, which)
     cloud = details.point_cloud_path if details else None
     return FrameSequence(
         category=category,
         name=name,
         frames=frames,
-        left_out=tuple(posed.left_out),
+        left_out=tuple(left_out),
         viewpoint_quality=details.viewpoint_quality if details else None,
         point_cloud_quality=details.point_cloud_quality if details else None,
         point_cloud=PointCloud(root, cloud) if cloud else None,

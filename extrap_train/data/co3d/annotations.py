@@ -1,5 +1,6 @@
 """CO3D's annotation entries (v1 and v2) as typed records, their JSON checked."""
 
+import logging
 import math
 import posixpath
 from collections.abc import Callable, Iterator
@@ -16,9 +17,11 @@ from extrap_train.geometry.pytorch3d import NDC_FORMATS
 
 T = TypeVar("T")
 
+log = logging.getLogger(__name__)
 
 VIEWPOINT = {"R": (3, 3), "T": (3,), "focal_length": (2,), "principal_point": (2,)}
 """The keys of a viewpoint and their shapes, in the order in which their numbers are kept."""
+_REMEDY = "correct it, or is this no CO3D annotation file?"
 _CHALLENGE_TARGET = "_unseen"
 """What `meta.frame_type` then ends in."""
 
@@ -42,6 +45,15 @@ class FrameAnnotation:
 
 
 @dataclass(frozen=True, slots=True)
+class BadEntry:
+    """An entry that cannot be read, and why."""
+
+    sequence: str | None
+    """The name of its sequence, if that much can be read."""
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
 class SequenceAnnotation:
     """What is known of a whole sequence."""
 
@@ -51,31 +63,48 @@ class SequenceAnnotation:
     point_cloud_quality: float | None
 
 
-def read_frame_annotations(file: Path) -> Iterator[FrameAnnotation]:
+def read_frame_annotations(file: Path) -> Iterator[FrameAnnotation | BadEntry]:
     """Every entry of a `frame_annotations.jgz`, in the file's order, one at a time."""
     return _parse_entries(file, _frame)
 
 
 def read_sequence_annotations(file: Path) -> dict[str, SequenceAnnotation]:
-    """The entries of a `sequence_annotations.jgz` by their sequence's name."""
-    return {entry.name: entry for entry in _parse_entries(file, _sequence)}
+    """The entries of a `sequence_annotations.jgz` by their sequence's name.
+
+    Warns of entries that cannot be read; InputError where that is so of all.
+    """
+    found, bad = {}, []
+    for entry in _parse_entries(file, _sequence):
+        if isinstance(entry, BadEntry):
+            bad.append(entry.reason)
+        else:
+            found[entry.name] = entry
+    if not found:
+        raise InputError(bad[0])
+    if bad:
+        log.warning("%d sequences have no description, the first: %s", len(bad), bad[0])
+    return found
 
 
-def _parse_entries(file: Path, parse: Callable[[Any, Path], T]) -> Iterator[T]:
+def _parse_entries(file: Path, parse: Callable[[Any, Path], T]) -> Iterator[T | BadEntry]:
     for index, entry in enumerate(read_json_list(file, "annotations")):
         try:
-            parsed = parse(entry, file)
+            parsed: T | BadEntry = parse(entry, file)
         except KeyError as error:
-            raise InputError(
-                f"{file}: entry {index} has no {error}; is this a CO3D annotation file?"
-            ) from None
-        except InputError:
-            raise
+            parsed = _bad_entry(entry, f"{file}: entry {index} has no {error}; {_REMEDY}")
+        except InputError as error:
+            parsed = _bad_entry(entry, str(error))
         except (TypeError, ValueError, AttributeError, OverflowError) as error:
-            raise InputError(
-                f"{file}: entry {index} is malformed ({error}); is this a CO3D annotation file?"
-            ) from None
+            why = f"{file}: entry {index} is malformed ({error}); {_REMEDY}"
+            parsed = _bad_entry(entry, why)
         yield parsed
+
+
+def _bad_entry(entry: Any, reason: str) -> BadEntry:
+    try:
+        return BadEntry(_require_type(entry["sequence_name"], str, "sequence_name"), reason)
+    except (TypeError, ValueError, KeyError):
+        return BadEntry(None, reason)
 
 
 def _frame(entry: Any, file: Path) -> FrameAnnotation:

@@ -67,10 +67,27 @@ class Co3dFrames(Sequence[Frame]):
         table = np.concatenate([part.table for part in parts])
         return cls(parts[0].root, table[np.argsort(table["number"], kind="stable")])
 
-    @property
-    def has_duplicates(self) -> bool:
-        """Whether a photograph is listed twice."""
-        return len(np.unique(self.table["image_path"])) < len(self)
+    def without_duplicates(self, file: Path) -> tuple["Co3dFrames", tuple[str, ...]]:
+        """Each photograph once, and why some are left out: their entries contradict each other.
+
+        Equal entries, whatever their number, are one frame.
+        """
+        paths, first, place = np.unique(
+            self.table["image_path"], return_index=True, return_inverse=True
+        )
+        if len(paths) == len(self):
+            return self, ()
+        agrees = np.ones(len(self), bool)
+        for name in set(self.table.dtype.names or ()) - {"number"}:
+            column = self.table[name]
+            agrees &= (column == column[first][place]).reshape(len(self), -1).all(1)
+        contradictory = np.unique(place[~agrees])
+        reasons = tuple(
+            f"{file}: lists {os.fsdecode(paths[i])} twice, with different cameras or files; remove "
+            "the wrong entry"
+            for i in contradictory
+        )
+        return replace(self, table=self.table[np.sort(np.delete(first, contradictory))]), reasons
 
     def __len__(self) -> int:
         return len(self.table)
