@@ -9,7 +9,7 @@ from pathlib import Path
 
 from benchmarks.catalogue import Catalogue, lpips_weights_of, require_only_output
 from extrap_train.command_options import option_rows
-from extrap_train.config import CATEGORIES, TableConfig
+from extrap_train.config import TableConfig
 from extrap_train.errors import InputError
 from extrap_train.exits import Ended, ends_in_one_line
 
@@ -131,7 +131,7 @@ def _list(options: argparse.Namespace) -> int:
     catalogue = Catalogue.with_own(options.config_dir)
     for kind in [options.kind] if options.kind else KINDS:
         if kind == "categories":
-            print(f"categories: {' '.join(CATEGORIES)}")
+            print(f"categories: {' '.join(catalogue.categories())}")
             continue
         print(f"{kind}:")
         for name in catalogue.names(kind.removesuffix("s")):

@@ -43,6 +43,11 @@ class Catalogue:
         """Names of the `table`s, `method`s or `reported` numbers."""
         return choices_of(kind, self.own)
 
+    def categories(self) -> list[str]:
+        """Names of the single categories, without the choices that are several."""
+        names = self.names("category")
+        return [n for n in names if len(self.content("category", n).get("members", ())) == 1]
+
     def content(self, kind: str, name: str) -> dict[str, Any]:
         """A YAML's content as it stands; raises InputError for an unknown name."""
         for folder in [*reversed(self.own), conf.__path__[0]]:

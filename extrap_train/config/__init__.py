@@ -24,7 +24,6 @@ from extrap_train.config.commands import (
     ValidationConfig,
 )
 from extrap_train.config.data_sources import (
-    CATEGORIES,
     AlikedMatcherConfig,
     CategoryConfig,
     Co3dConfig,

@@ -5,8 +5,6 @@ from typing import Any, ClassVar
 
 from extrap_train.config.options import MISSING, option
 
-CATEGORIES = ("apple", "book", "chair", "cup", "hydrant", "teddybear")
-
 
 @dataclass
 class CategoryConfig:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from extrap_train.config import CATEGORIES
 from extrap_train.data.synthetic import build_scene, handheld_orbit, render, surface_points
+from extrap_train.data.synthetic.categories import NAMES as CATEGORIES
 from extrap_train.data.synthetic.shapes import move_mesh
 from extrap_train.errors import InputError
 from extrap_train.geometry.cameras import project

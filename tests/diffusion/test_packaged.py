@@ -2,7 +2,7 @@
 
 import pytest
 
-from extrap_train.config.data_sources import CATEGORIES
+from extrap_train.data.synthetic.categories import NAMES as CATEGORIES
 from extrap_train.diffusion.model_files import load_model
 from extrap_train.diffusion.packaged import packaged_name, packaged_names, packaged_weights
 from extrap_train.errors import InputError

@@ -19,6 +19,9 @@ from extrap_train.data.synthetic.noise import fractal_noise
 from extrap_train.data.synthetic.parts import Part, placement
 from extrap_train.data.synthetic.shapes import Mesh, displace, lathe, sheet, sweep
 
+PLACES = (0.2, 0.0, 0.8)
+"""How likely one is found outdoors, on a floor, on a table."""
+
 
 @dataclass(frozen=True)
 class AppleSkin:

@@ -20,6 +20,9 @@ from extrap_train.data.synthetic.parts import Part, placement
 from extrap_train.data.synthetic.shapes import rounded_box
 from extrap_train.data.synthetic.vectors import Real
 
+PLACES = (0.15, 0.2, 0.65)
+"""How likely one is found outdoors, on a floor, on a table."""
+
 
 @dataclass(frozen=True)
 class Cover:

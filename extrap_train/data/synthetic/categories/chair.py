@@ -10,6 +10,9 @@ from extrap_train.data.synthetic.parts import Part, placement
 from extrap_train.data.synthetic.shapes import Mesh, capsule, lathe, rounded_box, sheet, sweep, xyz
 from extrap_train.data.synthetic.vectors import Real
 
+PLACES = (0.3, 0.7, 0.0)
+"""How likely one is found outdoors, on a floor, on a table."""
+
 Back = Callable[[float, float], np.ndarray]
 """A point of the back: -1 left … 1 right, 0 seat … 1 top."""
 _PAINTS = ["#c9c4b8", "#7a2f2f", "#2f5a5f", "#d9b04a", "#3a3f4a", "#4f7a4f", "#b8623a"]

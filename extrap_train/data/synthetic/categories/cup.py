@@ -23,6 +23,9 @@ from extrap_train.data.synthetic.parts import Part, placement
 from extrap_train.data.synthetic.shapes import Mesh, lathe, sweep
 from extrap_train.data.synthetic.vectors import Real
 
+PLACES = (0.2, 0.0, 0.8)
+"""How likely one is found outdoors, on a floor, on a table."""
+
 
 @dataclass(frozen=True)
 class Place:

@@ -15,6 +15,9 @@ from extrap_train.data.synthetic.parts import Part, placement
 from extrap_train.data.synthetic.shapes import Mesh, lathe, merge, move_mesh, sweep
 from extrap_train.data.synthetic.vectors import Real
 
+PLACES = (1.0, 0.0, 0.0)
+"""How likely one is found outdoors, on a floor, on a table."""
+
 _PAINTS = ["#c2261f", "#d9b21f", "#2f5fa8", "#b4b8bb", "#dedcd2", "#3f7f4a", "#d9701f"]
 
 

@@ -16,6 +16,9 @@ from extrap_train.data.synthetic.parts import Part, placement
 from extrap_train.data.synthetic.shapes import capsule, ellipsoid, merge, move_mesh, sweep, xyz
 from extrap_train.data.synthetic.vectors import Real
 
+PLACES = (0.25, 0.4, 0.35)
+"""How likely one is found outdoors, on a floor, on a table."""
+
 _FURS = ["#8a5a32", "#b98a55", "#d9c49a", "#5c3a24", "#8f8a86", "#e3dccf", "#c98f9a", "#a8713f"]
 _PADS = ["#d9c49a", "#f0e6d2", "#c9a070", "#e8cfc0", "#5a4030"]
 
