@@ -102,6 +102,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="scoring.lpips_weights.NET=FILE",
         help="files of weights on this machine",
     )
+    _add_config_dir(verify)
     compare = command("compare", _compare, "compare two results of one protocol, with intervals")
     compare.add_argument("before", help="folder of a table's results")
     compare.add_argument("after", help="folder of a table's results")
@@ -180,6 +181,7 @@ def _report(options: argparse.Namespace) -> int:
 
 
 def _verify(options: argparse.Namespace) -> int:
+    Catalogue.with_own(options.config_dir)  # metrics are imported from there
     weights = lpips_weights_of(options.overrides)
     from benchmarks.report.verify import verify
     from benchmarks.run.plan import TableFolder

@@ -15,9 +15,11 @@ import conf
 from extrap_train.command_options import CommandOptions, choices_of, open_own_folders
 from extrap_train.config import (
     LPIPS_NETS,
+    METRICS,
     CapturesConfig,
     DepthConfig,
     MethodConfig,
+    MetricConfig,
     SyntheticConfig,
     TableConfig,
     check_options,
@@ -57,15 +59,27 @@ class Catalogue:
 
     def method(self, name: str, options: Mapping[str, Any] | None = None) -> MethodConfig:
         """A method by name, with options that replace those of its file."""
-        content = self.content("method", name)
-        try:
-            typed = OmegaConf.merge(OmegaConf.structured(MethodConfig), {"name": name}, content)
-            values: dict[str, Any] = OmegaConf.to_container(typed, throw_on_missing=True)  # type: ignore[assignment]
-        except OmegaConfBaseException as error:
-            raise InputError(f"method {name}: {str(error).splitlines()[0]}") from None
-        method = MethodConfig(**values)
+        method = MethodConfig(**self._typed("method", name, MethodConfig, {"name": name}))
         method.options |= options or {}
         return method
+
+    def metric(self, name: str) -> MetricConfig:
+        """A metric of your own by name."""
+        if name in METRICS:
+            raise InputError(f"scoring.metrics: {name} is the package's; give yours another name")
+        metric = MetricConfig(**self._typed("metric", name, MetricConfig, {}))
+        check_options(metric, f"metric {name}: ")
+        return metric
+
+    def _typed(self, kind: str, name: str, schema: type, more: Mapping[str, Any]) -> dict[str, Any]:
+        """A YAML's values, of the types that a dataclass declares."""
+        content = self.content(kind, name)
+        try:
+            typed = OmegaConf.merge(OmegaConf.structured(schema), more, content)
+            values: dict[str, Any] = OmegaConf.to_container(typed, throw_on_missing=True)  # type: ignore[assignment]
+        except OmegaConfBaseException as error:
+            raise InputError(f"{kind} {name}: {str(error).splitlines()[0]}") from None
+        return values
 
     def depth(self, name: str) -> DepthConfig:
         """A depth source's options by its name, as `depth=` composes them."""
@@ -89,12 +103,14 @@ class Catalogue:
     def table(self, name: str, overrides: Sequence[str] = ()) -> TableConfig:
         """A table by name, with `key=value` on top, composed as every other command's options."""
         table = _compose(name, self.content("table", name), overrides)
+        table.scoring.own = {metric: self.metric(metric) for metric in table.scoring.metrics}
         check_options(table)
         return table
 
     def check(self, table: TableConfig) -> None:
         """InputError for options that exclude each other, and for names that are unknown."""
         _check_table(table)
+        _require_known("columns", table.columns, [*METRICS, *table.scoring.metrics])
         _require_known("rules.depth", [table.rules.depth], choices_of("depth", self.own))
         _require_known("options", table.options, self.names("method"))
         _require_known("reported", filter(None, [table.reported]), self.names("reported"))

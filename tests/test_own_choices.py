@@ -1,4 +1,4 @@
-"""A depth source or a matcher of your own is a module and a YAML in a folder, for any command."""
+"""A depth source, a matcher or a metric of your own is a module and a YAML in a folder."""
 
 import sys
 from collections.abc import Iterator
@@ -8,12 +8,21 @@ import pytest
 import torch
 
 from benchmarks.catalogue import Catalogue
-from extrap_train.config import DepthConfig, MonocularConfig, OwnDepthConfig, OwnMatcherConfig
+from benchmarks.protocol.prepared_scene import Truth
+from benchmarks.run.identity import scores_manifest, sources_digest
+from benchmarks.score.scoring import score_images
+from extrap_train.config import (
+    DepthConfig,
+    MonocularConfig,
+    OwnDepthConfig,
+    OwnMatcherConfig,
+    metric_direction,
+)
 from extrap_train.depth import DepthSource
 from extrap_train.depth.sources import depth_source, weight_files
 from extrap_train.errors import InputError
 from extrap_train.matching.matchers import matcher
-from extrap_train.views import Camera, View
+from extrap_train.views import Camera, View, stack_cameras
 
 _DEPTH = """
 from dataclasses import dataclass
@@ -54,6 +63,24 @@ class Still:
         corner = torch.tensor([[0.5, 0.5]])
         return Matches(corner, corner, torch.ones(1))
 """
+_METRIC = """
+from dataclasses import dataclass
+
+import torch
+
+
+@dataclass(frozen=True)
+class Brightness:
+    power: float = 1.0
+
+    def score(self, images, truth):
+        return (images**self.power).mean((1, 2, 3))
+
+
+class Single:
+    def score(self, images, truth):
+        return torch.tensor(0.5)
+"""
 _FLAT = "defaults: [own_schema, _self_]\nname: flat\nfactory: own_flat.Flat\n"
 
 
@@ -61,10 +88,14 @@ _FLAT = "defaults: [own_schema, _self_]\nname: flat\nfactory: own_flat.Flat\n"
 def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.setenv("PYTHONPATH", "")
-    for group in ("depth", "matcher"):
+    for group in ("depth", "matcher", "metric"):
         (tmp_path / group).mkdir()
     (tmp_path / "own_flat.py").write_text(_DEPTH)
     (tmp_path / "own_still.py").write_text(_MATCHER)
+    (tmp_path / "own_bright.py").write_text(_METRIC)
+    (tmp_path / "metric" / "bright.yaml").write_text(
+        "factory: own_bright.Brightness\nbetter: lower\noptions: {power: 2.0}\n"
+    )
     (tmp_path / "depth" / "flat.yaml").write_text(f"{_FLAT}options: {{distance: 2.5}}\n")
     (tmp_path / "matcher" / "still.yaml").write_text(
         "defaults: [own_schema, _self_]\nname: still\nfactory: own_still.Still\n"
@@ -73,7 +104,7 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         "defaults: [monocular_schema, /matcher@matcher: still, _self_]\nname: mono\n"
     )
     yield tmp_path
-    for module in ("own_flat", "own_still"):
+    for module in ("own_flat", "own_still", "own_bright"):
         sys.modules.pop(module, None)
 
 
@@ -125,3 +156,59 @@ def test_a_file_that_an_option_names_decides_about_the_depth(own: Path, tmp_path
     options = {"weights": str(tmp_path / "flat.pt")}
     found = weight_files(OwnDepthConfig(factory="own_flat.Flat", options=options))
     assert [path.name for path in found] == ["own_flat.py", "flat.pt"]
+
+
+def _truth() -> Truth:
+    cameras = stack_cameras([_view().camera])
+    image, mask = torch.full((1, 3, 16, 16), 0.5), torch.ones(1, 16, 16)
+    return Truth(image, cameras, warps=image, masks=mask, depths=None, surface=None)
+
+
+def test_a_table_takes_a_metric_from_a_folder(own: Path) -> None:
+    """Beside the package's metrics, with its options, direction and identity."""
+    catalogue = Catalogue.with_own([str(own)])
+    words = ["scoring.metrics=[bright]", "columns=[psnr,bright]", "scoring.lpips=[]"]
+    table = catalogue.table("table1", [*words, "scoring.dists=false"])
+    catalogue.check(table)
+    scoring = table.scoring
+    assert metric_direction("bright", scoring.own) == -1
+    assert metric_direction("psnr", scoring.own) == 1
+    scores = score_images(torch.full((1, 3, 16, 16), 0.5), _truth(), scoring)
+    assert scores["bright"].value == pytest.approx(0.25)
+    assert {"psnr", "ssim"} <= scores.keys()
+    before = scores_manifest(scoring)
+    sources_digest.cache_clear()
+    (own / "own_bright.py").write_text(_METRIC + "\n")
+    assert scores_manifest(scoring).inputs != before.inputs
+    assert scores_manifest(scoring).options == before.options
+
+
+@pytest.mark.parametrize(
+    ("yaml", "said"),
+    [
+        ("factory: own_bright.Brightness\nbetter: upwards\n", "better"),
+        ("better: lower\n", "factory"),
+        ("factory: own_bright.Brightness\nworse: 1\n", "worse"),
+        ("factory: own_bright.Single\n", "one number per image"),
+        ("factory: own_bright.Dark\n", "factory own_bright.Dark"),
+        ("factory: own_flat.Flat\n", "score"),
+    ],
+)
+def test_a_metric_that_does_not_fit_is_one_line(own: Path, yaml: str, said: str) -> None:
+    (own / "metric" / "odd.yaml").write_text(yaml)
+    catalogue = Catalogue.with_own([str(own)])
+    words = ["scoring.metrics=[odd]", "scoring.lpips=[]", "scoring.dists=false"]
+    truth = _truth()
+    with pytest.raises(InputError) as error:
+        score_images(truth.images, truth, catalogue.table("table1", words).scoring)
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_metric_does_not_take_the_place_of_the_packages(own: Path) -> None:
+    (own / "metric" / "psnr.yaml").write_text("factory: own_bright.Brightness\n")
+    catalogue = Catalogue.with_own([str(own)])
+    with pytest.raises(InputError, match=r"scoring\.metrics: psnr"):
+        catalogue.table("table1", ["scoring.metrics=[psnr]"])
+    with pytest.raises(InputError, match="columns"):
+        catalogue.check(catalogue.table("table1", ["columns=[bright]"]))

@@ -113,7 +113,8 @@ class Results:
             table = table[table["category"] == category]
         rows: list[dict[str, Any]] = []
         for (draw, n_views, metric), part in table.groupby(["draw", "n_views", "metric"]):
-            rows += _ranked(part, {"draw": draw, "n_views": n_views, "metric": metric})
+            head = {"draw": draw, "n_views": n_views, "metric": metric}
+            rows += _ranked(part, head, metric_direction(str(metric), self.plan.table.scoring.own))
         return pd.DataFrame(rows, columns=MEANS)
 
 
@@ -129,10 +130,12 @@ def read_results(folder: TableFolder) -> Results:
     return Results(folder, plan, planned_cells(folder.cells, plan))
 
 
-def _ranked(part: pd.DataFrame, head: dict[str, Any]) -> list[dict[str, Any]]:
-    """Means of one column, with ranks and paired differences to the best."""
+def _ranked(part: pd.DataFrame, head: dict[str, Any], sign: int) -> list[dict[str, Any]]:
+    """Means of one column, with ranks and paired differences to the best.
+
+    `sign` is 1 where higher is better, -1 where lower is, 0 for no ranks.
+    """
     values = part.pivot_table(index=UNIT, columns="method", values="value", sort=False)
-    sign = metric_direction(head["metric"])
     complete = values.notna().all()
     means = by_capture(values).mean()
     competing = means[complete] if sign and complete.mean() >= 0.5 else means[:0]

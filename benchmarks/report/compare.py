@@ -45,10 +45,14 @@ def compare(one: Results, two: Results) -> pd.DataFrame:
     if both.empty:
         raise InputError(f"{one.folder.path} and {two.folder.path} have no finished cell in common")
     judges = _scorings(one), _scorings(two)
+    own = one.plan.table.scoring.own | two.plan.table.scoring.own
     rows = []
     for head, part in both.groupby(_HEADING, sort=False):
         metric = str(head[-1])
-        row = {**dict(zip(_HEADING, head, strict=True)), **_change(part, metric_direction(metric))}
+        row = {
+            **dict(zip(_HEADING, head, strict=True)),
+            **_change(part, metric_direction(metric, own)),
+        }
         cells = part[CELL].itertuples(index=False, name=None)
         alike = metric in MEASURED or all(judges[0][cell] == judges[1][cell] for cell in cells)
         rows.append({**row, "scoring": "same" if alike else "other"})

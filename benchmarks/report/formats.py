@@ -19,7 +19,7 @@ from torch import Tensor
 from benchmarks.protocol.array_files import pictures_of, read_limited
 from benchmarks.protocol.prepared_scene import Scene
 from benchmarks.report.aggregate import Results
-from benchmarks.report.table_layout import Entry, Layout, heading_of, name_of
+from benchmarks.report.table_layout import Entry, Layout, name_of
 from benchmarks.run.cells import OK, Cell, one_line
 from extrap_train.data.images import to_eight_bits
 from extrap_train.errors import InputError
@@ -77,7 +77,7 @@ def _spreadsheet_text(value: object) -> object:
 def numbers(layout: Layout, width: int) -> str:
     """The panel over everything in plain columns, in as many blocks as the width needs."""
     panel = layout.panels[0]
-    columns = [(heading_of(metric), f"{n} views") for metric, n in panel.columns]
+    columns = [(panel.heading(metric), f"{n} views") for metric, n in panel.columns]
     frame = pd.DataFrame(
         [[_plain(entry) for entry in row.entries] for row in panel.rows],
         index=[row.label for row in panel.rows],
@@ -106,7 +106,7 @@ def _render(name: str, layout: Layout, special: dict[str, str], **delimiters: An
         trim_blocks=True, lstrip_blocks=True, finalize=partial(_escape, special), **delimiters
     )
     template = environment.from_string((files("benchmarks.report") / name).read_text("utf-8"))
-    return template.render(layout=layout, heading_of=heading_of)
+    return template.render(layout=layout)
 
 
 def _escape(special: dict[str, str], value: object) -> str:

@@ -2,14 +2,15 @@
 
 import re
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import pandas as pd
 
 from benchmarks.report.aggregate import FEWEST_CAPTURES, Results
 from benchmarks.run.cells import OK, one_line
-from extrap_train.config import metric_direction
+from extrap_train.config import MetricConfig, metric_direction
 
 NAMES = {
     "lpips_alex": "LPIPS (alex)",
@@ -68,6 +69,8 @@ class Panel:
     title: str
     columns: list[tuple[str, int]]
     rows: list[Row]
+    own: Mapping[str, MetricConfig] = field(default_factory=dict)
+    """The table's metrics that are not the package's."""
 
     @property
     def metrics(self) -> list[str]:
@@ -81,7 +84,11 @@ class Panel:
 
     def headings(self) -> list[str]:
         """Metric with its arrow and the number of views, per column."""
-        return [f"{heading_of(metric)} {n} views" for metric, n in self.columns]
+        return [f"{self.heading(metric)} {n} views" for metric, n in self.columns]
+
+    def heading(self, metric: str) -> str:
+        """A metric's name with an arrow to its better side."""
+        return f"{name_of(metric)} {_ARROWS[metric_direction(metric, self.own)]}"
 
 
 @dataclass(frozen=True)
@@ -100,11 +107,6 @@ class Layout:
         """The panel over everything, the published numbers, and the rest."""
         reported = [self.reported] if self.reported else []
         return [*self.panels[:1], *reported, *self.panels[1:]]
-
-
-def heading_of(metric: str) -> str:
-    """A metric's name with an arrow to its better side."""
-    return f"{name_of(metric)} {_ARROWS[metric_direction(metric)]}"
 
 
 def name_of(metric: str) -> str:
@@ -156,7 +158,7 @@ def _panel(
     counted = f"{captures} capture{'s' if captures > 1 else ''}"
     if captures < FEWEST_CAPTURES:
         counted += ": too few to tell methods apart"
-    return Panel(f"{title} ({counted})", columns, rows)
+    return Panel(f"{title} ({counted})", columns, rows, results.plan.table.scoring.own)
 
 
 def _entry(mean: Any, metric: str) -> Entry:

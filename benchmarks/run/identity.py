@@ -16,6 +16,7 @@ from benchmarks.protocol.draws import digest
 from benchmarks.protocol.prepared_scene import Scene
 from extrap_train.config import MethodConfig, RulesConfig, ScoringConfig
 from extrap_train.config.options import dotted
+from extrap_train.errors import InputError
 from extrap_train.metrics import BACKBONES, hub_cache
 from extrap_train.store.digests import file_digest
 from extrap_train.store.manifest import Manifest
@@ -76,9 +77,11 @@ def image_options(config: MethodConfig, rules: RulesConfig, device: str) -> dict
 
 def scores_manifest(scoring: ScoringConfig) -> Manifest:
     """What the scores of images follow from; raises InputError where a named file is missing."""
-    options = asdict(scoring) | {"lpips_weights": sorted(scoring.lpips_weights)}
+    options = dotted(asdict(scoring) | {"lpips_weights": sorted(scoring.lpips_weights)})
+    modules = {name: metric.factory.rpartition(".")[0] for name, metric in scoring.own.items()}
+    code = {f"code of {name}": sources_digest((), module) for name, module in modules.items()}
     files = {column: file_digest(file) for column, file in judging_files(scoring).items()}
-    return Manifest.of(options, files | {"code": sources_digest(_SCORING)})
+    return Manifest.of(options, files | code | {"code": sources_digest(_SCORING)})
 
 
 def scene_origin(*content: object) -> str:
@@ -134,8 +137,12 @@ def _import_root(module: str) -> Path:
     """The folder on the import path that a module is found in, as `root` of root/package/module.py;
     of a module that belongs to an installed package its own file.
     """
-    spec = importlib.util.find_spec(module)
-    assert spec is not None  # its method has been built
+    try:
+        spec = importlib.util.find_spec(module)
+    except (ImportError, ValueError):
+        spec = None
+    if spec is None:
+        raise InputError(f"module {module}: not found; is its folder given with --config-dir?")
     file = Path(str(spec.origin)).resolve()
     if any(part in _NO_SOURCES for part in file.parts):
         return file

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -16,8 +17,9 @@ from benchmarks.protocol.array_files import array_of, pictures_of
 from benchmarks.protocol.prepared_scene import Scene, Truth
 from benchmarks.score import Score
 from benchmarks.score.view_consistency import tsed, warp_psnr
-from extrap_train.config import ScoringConfig
+from extrap_train.config import MetricConfig, ScoringConfig
 from extrap_train.errors import InputError
+from extrap_train.factories import make_object
 from extrap_train.metrics import (
     Distance,
     dists_distance,
@@ -57,7 +59,26 @@ def score_images(
         | scores
         | megascenes_compat(images, truth)
         | _consistency(images, truth)
+        | {name: _own(name, metric, images, truth) for name, metric in config.own.items()}
     )
+
+
+@runtime_checkable
+class Metric(Protocol):
+    """A metric of your own: a class whose fields are its options."""
+
+    def score(self, images: Float[Tensor, "n 3 h w"], truth: Truth) -> Float[Tensor, " n"]:
+        """One number per image, colours in [0, 1]; NaN where it has no meaning."""
+        ...
+
+
+def _own(name: str, config: MetricConfig, images: Tensor, truth: Truth) -> Score:
+    prefix = f"metric {name}: "
+    metric: Metric = make_object(config.factory, config.options, f"metric {name}", Metric, prefix)
+    values = metric.score(images, truth)
+    if not isinstance(values, Tensor) or values.shape != (len(images),):
+        raise InputError(f"{prefix}{config.factory} must return one number per image, a tensor (n)")
+    return _of_images(values, "it gives no number for any image")
 
 
 def score_files(

@@ -74,6 +74,7 @@ from extrap_train.config.table_options import (
     METRICS,
     CapturesConfig,
     MethodConfig,
+    MetricConfig,
     QuickConfig,
     RulesConfig,
     ScoringConfig,

@@ -1,5 +1,6 @@
 """What a comparison table is made of: captures, protocol, methods, metrics."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,8 +24,25 @@ may be few and good.
 METRICS = (*_HIGHER_IS_BETTER, *_LOWER_IS_BETTER, *_SAME_FOR_ALL_METHODS, *_UNRANKED)
 
 
-def metric_direction(metric: str) -> int:
-    """1 where higher is better, -1 where lower is, 0 for a number that ranks no method."""
+@dataclass
+class MetricConfig:
+    """A metric of your own, `conf/metric/NAME.yaml`."""
+
+    factory: str = MISSING
+    """`package.module.Class`; its fields are the options."""
+    better: str = option(
+        "neither", "which values of the metric are better", known=("higher", "lower", "neither")
+    )
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+def metric_direction(metric: str, own: Mapping[str, MetricConfig] | None = None) -> int:
+    """1 where higher is better, -1 where lower is, 0 for a number that ranks no method.
+
+    `own` are the metrics of a table that are not the package's.
+    """
+    if own and metric in own:
+        return {"higher": 1, "lower": -1}.get(own[metric].better, 0)
     if metric in _HIGHER_IS_BETTER:
         return 1
     return -1 if metric in _LOWER_IS_BETTER or metric.startswith("lpips") else 0
@@ -95,7 +113,7 @@ class RulesConfig:
 
 @dataclass
 class ScoringConfig:
-    """Which perceptual networks judge, and where their weights lie."""
+    """What judges images besides the usual metrics: perceptual networks, and metrics of yours."""
 
     lpips: list[str] = option(
         ["alex"], "LPIPS backbones, one column each", known=LPIPS_NETS, is_set=True
@@ -106,6 +124,11 @@ class ScoringConfig:
         known=LPIPS_NETS,
     )
     dists: bool = option(True, "measure DISTS, with torchvision's VGG-16 from torch's hub cache")
+    metrics: list[str] = option(
+        [], "metrics of your own: names of files below metric/ in --config-dir", is_set=True
+    )
+    own: dict[str, MetricConfig] = field(default_factory=dict)
+    """What these files say; the catalogue fills it in."""
 
 
 @dataclass
@@ -136,7 +159,6 @@ class TableConfig:
     columns: list[str] = option(
         [],
         "metrics of the printed table in their order; the CSV holds all of them",
-        known=METRICS,
         is_set=True,
     )
     reported: str | None = option(
