@@ -14,7 +14,14 @@ import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 
-from extrap_train.config import SceneOptions, SyntheticConfig, TrainConfig, dotted, resolve_paths
+from extrap_train.config import (
+    SceneOptions,
+    SyntheticConfig,
+    TrainConfig,
+    dotted,
+    packaged_names,
+    resolve_paths,
+)
 from extrap_train.data.prepared import PreparedData
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import partial_path, write_atomic
@@ -169,8 +176,9 @@ def run_folder(config: TrainConfig) -> RunFolder:
 def run_manifest(config: TrainConfig, prepared: list[PreparedData]) -> Manifest:
     """What the run follows from: its options, the prepared data, and the weights it starts from."""
     inputs, split = trained_on(config, prepared)
-    if (start := config.model.start) is not None and (path := Path(start)).exists():
-        inputs["model.start"] = weights_digest(path)
+    start = config.model.start
+    if start is not None and start not in packaged_names() and Path(start).exists():
+        inputs["model.start"] = weights_digest(Path(start))
     return Manifest.of(run_identity(config), inputs, split)
 
 

@@ -288,8 +288,10 @@ def test_a_start_is_a_path_where_there_is_one(
 
     monkeypatch.chdir(tmp_path)
     named = start("base")
-    (tmp_path / "base").mkdir()
-    assert start("base") == start("./base/") != named
+    for name in ("base", "mine"):
+        (tmp_path / name).mkdir()
+    assert start("mine") == start("./mine/")
+    assert start("base") == named != start("./base/")
 
 
 @pytest.mark.parametrize(

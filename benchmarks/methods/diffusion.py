@@ -23,6 +23,7 @@ from extrap_train.config import (
     NEAREST_ALONE,
     SamplerConfig,
     SamplerOptions,
+    packaged_names,
     sampler_for,
 )
 from extrap_train.config.options import option, unset
@@ -131,7 +132,7 @@ class Diffusion:
         name = (self.weights or packaged_name(self.family, category)).replace(
             "{category}", category
         )
-        if self.weights is not None and Path(name).is_dir():
+        if self.weights is not None and name not in packaged_names() and Path(name).is_dir():
             return Path(name)
         try:
             return packaged_weights(name)

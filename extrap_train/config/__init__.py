@@ -53,10 +53,13 @@ from extrap_train.config.model_options import (
 )
 from extrap_train.config.options import (
     MISSING,
+    MODEL_CONFIG,
+    PACKAGED_MODELS,
     Option,
     check_options,
     dotted,
     options_of,
+    packaged_names,
     resolve_path,
     resolve_paths,
 )

@@ -11,7 +11,7 @@ from extrap_train.config.model_options import (
     SamplerConfig,
     SamplerOptions,
 )
-from extrap_train.config.options import check_options
+from extrap_train.config.options import check_options, packaged_names
 from extrap_train.errors import InputError
 
 _MAX_LEVELS, _MAX_WIDTH = 8, 8192
@@ -37,7 +37,7 @@ def validate(config: TrainConfig | DataPrepConfig) -> None:
         _check_model(config.model)
         if config.task in PAIR_TASKS:
             _check_pairs(config.model, config.prep)
-        _check_completion(config)
+        _check_inputs(config)
         if config.weights is None:
             sampler_for(config.sampler, config.model)
         else:  # what other weights recommend is known when they are read
@@ -51,15 +51,24 @@ def validate(config: TrainConfig | DataPrepConfig) -> None:
 
 def notes(config: TrainConfig | DataPrepConfig) -> list[str]:
     """What is allowed and may surprise, one line each."""
-    if not (isinstance(config, TrainConfig) and isinstance(config.data, SyntheticConfig)):
+    if not isinstance(config, TrainConfig):
         return []
+    found = [
+        f"{option}={name}: the packaged model is meant; for the folder of that name here give "
+        f"{option}=./{name}"
+        for option, name in {"weights": config.weights, "model.start": config.model.start}.items()
+        if name in packaged_names() and Path(str(name)).exists()
+    ]
+    if not isinstance(config.data, SyntheticConfig):
+        return found
     model, size = config.model, config.data.image_size
     if config.task not in PAIR_TASKS or size <= model.warp_size:
-        return []
+        return found
     return [
+        *found,
         f"data.image_size={size}: photographs are reduced to prep.image_size={model.warp_size} and "
         f"views generated at model.image_size={model.image_size}; for larger views give "
-        f"model.image_size={size} prep.image_size={size * model.warp_scale}"
+        f"model.image_size={size} prep.image_size={size * model.warp_scale}",
     ]
 
 
@@ -172,8 +181,13 @@ def _check_intervals(trainer: TrainerConfig) -> None:
         )
 
 
-def _check_completion(config: TrainConfig) -> None:
+def _check_inputs(config: TrainConfig) -> None:
     named = len(config.input_frames)
+    if named and config.inputs is not None:
+        raise InputError(
+            f"inputs={config.inputs} beside input_frames, which names {named} frames: leave one of "
+            "them out"
+        )
     if config.task == "complete" and (named or config.inputs) == 1:
         raise InputError(
             "one photograph does not show where its surfaces are; give at least two (inputs=3)"

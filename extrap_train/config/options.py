@@ -16,6 +16,10 @@ MISSING: Any = "???"  # OmegaConf's mark for "must be given"
 _PATHS = ("root", "checkpoint", "depth_network")
 _PATHS_OR_NAMES = ("model", "start")
 """What is no path here is the name of weights in the package or in a cache of downloads."""
+PACKAGED_MODELS = Path(__file__).parents[1] / "weights"
+"""Folder of the models that come with the package."""
+MODEL_CONFIG = "extrapolation_model.json"
+"""What makes a folder a model of this project: its configuration."""
 Options = TypeVar("Options")
 _KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
 
@@ -199,9 +203,17 @@ def resolve_paths(options: Options) -> Options:
     return replace(tree, **changes)
 
 
+def packaged_names() -> list[str]:
+    """All models that come with the package.
+
+    Such a name means that model wherever weights are named; a folder called so is `./NAME`.
+    """
+    return sorted(path.parent.name for path in PACKAGED_MODELS.glob(f"*/{MODEL_CONFIG}"))
+
+
 def resolve_path(name: str, value: Any) -> Any:
     """The value of the option called `name` in its group; of a path, the one that it leads to."""
-    if not isinstance(value, str) or not value:
+    if not isinstance(value, str) or not value or value in packaged_names():
         return value
     if name in _PATHS or (name in _PATHS_OR_NAMES and Path(value).exists()):
         return str(Path(value).resolve())

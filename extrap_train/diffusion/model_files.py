@@ -10,10 +10,10 @@ import torch
 from safetensors import safe_open
 from torch import Tensor
 
-from extrap_train.config import ModelConfig, dotted, validate_model
+from extrap_train.config import MODEL_CONFIG, ModelConfig, dotted, packaged_names, validate_model
 from extrap_train.diffusion.encoders import PixelPatches
 from extrap_train.diffusion.model import ExtrapolationModel
-from extrap_train.diffusion.packaged import MODEL_CONFIG, compress, packaged_weights, restore
+from extrap_train.diffusion.packaged import compress, packaged_weights, restore
 from extrap_train.diffusion.published.config_compat import SCHEDULER, require_same_config
 from extrap_train.diffusion.published.read import SOURCES, Shapes, read_published, weights_at
 from extrap_train.diffusion.transfer import narrowed, turned_pose, widened
@@ -265,7 +265,7 @@ def _filled(
 ) -> ExtrapolationModel:
     with torch.device("meta"):
         model = ExtrapolationModel(config)
-    given = Path(weights)
+    given = packaged_weights(weights) if weights in packaged_names() else Path(weights)
     path = given if is_compact(given) else weights_at(given)
     found = packaged_weights(weights, option) if path is None else path
     load_weights(model, found, option, to_train=to_train)

@@ -15,11 +15,9 @@ import torch
 from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
+from extrap_train.config import PACKAGED_MODELS, packaged_names
 from extrap_train.errors import InputError
 
-MODEL_CONFIG = "extrapolation_model.json"
-"""What makes a folder a model of this project: its configuration."""
-_FOLDER = Path(__file__).parents[1] / "weights"
 _LEVELS = 7
 """Of each sign: −7 … 7 in four bits."""
 _CLIPS = torch.linspace(0.35, 1.0, 14)
@@ -34,17 +32,12 @@ def packaged_weights(name: str, option: str = "model.start") -> Path:
             f"{option}={name} is neither a file or folder of weights nor one of the package's: "
             f"{', '.join(packaged_names())}"
         )
-    return _FOLDER / name
-
-
-def packaged_names() -> list[str]:
-    """All models of the package."""
-    return sorted(path.parent.name for path in _FOLDER.glob(f"*/{MODEL_CONFIG}"))
+    return PACKAGED_MODELS / name
 
 
 def packaged_steps(name: str) -> int | None:
     """How many steps a packaged model was trained for; None if that is not recorded."""
-    steps: dict[str, int] = json.loads((_FOLDER / "steps.json").read_bytes())
+    steps: dict[str, int] = json.loads((PACKAGED_MODELS / "steps.json").read_bytes())
     return steps.get(name)
 
 

@@ -9,7 +9,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from lightning.fabric import Fabric
 
-from extrap_train.config import ModelConfig, TrainConfig, dotted, sampler_for
+from extrap_train.config import ModelConfig, TrainConfig, dotted, packaged_names, sampler_for
 from extrap_train.data.scene_spec import scene_address
 from extrap_train.data.sequences import Frame
 from extrap_train.device import advise_on_sampling_memory, require_accelerator
@@ -19,7 +19,6 @@ from extrap_train.diffusion.model import ExtrapolationModel, use_channels_last
 from extrap_train.diffusion.model_files import is_own, load_model, published_model, saved_config
 from extrap_train.diffusion.packaged import (
     packaged_name,
-    packaged_names,
     packaged_steps,
     packaged_weights,
 )
@@ -55,13 +54,14 @@ class UsedWeights:
         if adapter and not adapter.is_dir():
             raise InputError(f"adapter={adapter}: no such folder; give an adapter of task=scene")
         run, steps = RunFolder(path.parent), packaged_steps(name)
-        if path.exists():
+        is_packaged = name in packaged_names()
+        if not is_packaged:
             is_of_run = path == run.model and run.summary.is_file()
             steps = Finished.read(run).steps if is_of_run else None
         return cls(
             name=name,
             sha256=weights_digest(_folder_of(name)),
-            is_packaged=not path.exists(),
+            is_packaged=is_packaged,
             steps=steps,
             adapter=str(adapter.resolve()) if adapter else None,
             adapter_sha256=folder_digest(adapter) if adapter else None,
@@ -132,6 +132,8 @@ def named_weights(config: TrainConfig) -> str:
 
     Raises InputError where nothing does.
     """
+    if config.weights in packaged_names():
+        return str(config.weights)
     path = newest_run(config).model if config.weights is None else Path(config.weights)
     if path.exists():
         return str(path.resolve())
@@ -179,7 +181,8 @@ def open_model(
 def _folder_of(weights: str) -> Path:
     """What `weights` names: a path, or the folder of a packaged model."""
     path = Path(weights)
-    return path if path.exists() else packaged_weights(weights, "weights")
+    is_path = weights not in packaged_names() and path.exists()
+    return path if is_path else packaged_weights(weights, "weights")
 
 
 def device_of(config: TrainConfig) -> torch.device:

@@ -3,12 +3,12 @@
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from extrap_train.config import TrainConfig
+from extrap_train.config import TrainConfig, packaged_names
 from extrap_train.data.module import PairModule
 from extrap_train.data.pair_examples import ExampleReader
 from extrap_train.data.prepared import PreparedData
 from extrap_train.diffusion.model_files import is_own, saved_config
-from extrap_train.diffusion.packaged import packaged_names, packaged_weights
+from extrap_train.diffusion.packaged import packaged_weights
 from extrap_train.errors import InputError
 from extrap_train.store.manifest import MANIFEST, Manifest, read_manifest
 
@@ -55,9 +55,7 @@ def _ancestors(start: str | None) -> Iterator[tuple[str, Manifest]]:
     known: set[str] = set()
     while start is not None and start not in known:
         known.add(start)
-        folder = Path(start)
-        if not folder.exists() and start in packaged_names():
-            folder = packaged_weights(start)
+        folder = packaged_weights(start) if start in packaged_names() else Path(start)
         if not is_own(folder):
             return
         if (folder.resolve().parent / MANIFEST).is_file():

@@ -2,9 +2,10 @@
 
 import pytest
 
+from extrap_train.config import packaged_names
 from extrap_train.data.synthetic.categories import NAMES as CATEGORIES
 from extrap_train.diffusion.model_files import load_model
-from extrap_train.diffusion.packaged import packaged_name, packaged_names, packaged_weights
+from extrap_train.diffusion.packaged import packaged_name, packaged_weights
 from extrap_train.errors import InputError
 
 _COMPARED = ["base", "megascenes", *(f"ours-{category}" for category in CATEGORIES), "zeronvs"]

@@ -90,6 +90,16 @@ def test_a_single_view_is_refused_before_the_scene_is_read(
     assert "at least two" in refused({"no": "cameras"}, one)
 
 
+@pytest.mark.parametrize("task", ["complete", "view", "scene", "category"])
+@pytest.mark.parametrize("inputs", [1, 2, 3])
+def test_a_number_beside_names_is_refused(
+    task: str, inputs: int, refused: Command, tmp_path: Path
+) -> None:
+    (tmp_path / "scene").mkdir()
+    both = [f"task={task}", f"inputs={inputs}", "input_frames=[a.png,b.png]"]
+    assert f"inputs={inputs} beside input_frames" in refused({"no": "cameras"}, *both)
+
+
 def test_a_scene_of_another_category_needs_a_named_model(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -6,14 +6,16 @@ from pathlib import Path
 import pytest
 
 from extrap_train.config import (
+    MODEL_CONFIG,
     CategoryConfig,
     DatasetDepthConfig,
     FlowMatcherConfig,
     ModelConfig,
     SyntheticConfig,
     TrainConfig,
+    packaged_names,
 )
-from extrap_train.diffusion.packaged import MODEL_CONFIG, packaged_names, packaged_weights
+from extrap_train.diffusion.packaged import packaged_weights
 from extrap_train.errors import InputError
 from extrap_train.store.manifest import MANIFEST, Manifest, Split
 from extrap_train.store.records import write_record

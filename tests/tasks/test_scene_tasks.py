@@ -63,7 +63,7 @@ def test_the_photograph_that_is_asked_for_is_no_input(
         assert "frame000003" not in given[-1]
         assert "PSNR against the photograph" in capsys.readouterr().out
     named = "input_frames=[frame000001,frame000003,frame000005]"
-    command(*again, named)
+    command(*again, "inputs=null", named)
     assert "frame000003" in given[-1]
     said = capsys.readouterr().out
     assert "no PSNR: frame000003 is an input itself" in said
@@ -277,7 +277,8 @@ def test_no_held_out_view_is_generated_from_where_it_stands_nor_by_who_has_learn
     options = ["complete.poses=capture", "complete.splats.fit=false", "sampler.steps=1"]
     options += ["complete.confidence.attempts=1", f"adapter={adapter}"]
     inputs = ",".join(f"frame00000{index}" for index in range(4))
-    command("task=complete", f"weights={weights}", *options, f"input_frames=[{inputs}]")
+    options += ["inputs=null", f"input_frames=[{inputs}]"]
+    command("task=complete", f"weights={weights}", *options)
     summary = json.loads((tmp_path / "complete" / "hydrant_0000" / "summary.json").read_text())
     assert summary["views"]["generated"] == 4
     assert summary["held_out"]["views"] == 3
