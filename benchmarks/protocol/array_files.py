@@ -18,7 +18,7 @@ from plyfile import PlyData, PlyParseError
 from pydantic import AfterValidator, Field
 from torch import Tensor
 
-from extrap_train.data.images import ARRAY_ERRORS
+from extrap_train.data.depth_files import ARRAY_ERRORS
 from extrap_train.data.picture_files import DECODER_ERRORS
 from extrap_train.errors import InputError
 

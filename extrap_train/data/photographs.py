@@ -12,13 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrap_train.data.camera_check import PoseConvention, find_pose_fault, require_sound
-from extrap_train.data.images import (
-    known_depth,
-    read_depth,
-    read_depth_mask,
-    read_photograph,
-    read_sixteen_bit,
-)
+from extrap_train.data.depth_files import DepthFile
+from extrap_train.data.images import read_photograph
 from extrap_train.data.listed_files import PICTURE_SUFFIXES, ListedFiles
 from extrap_train.data.paths import require_file
 from extrap_train.data.picture_files import image_size, same_view
@@ -26,19 +21,6 @@ from extrap_train.data.sequences import Frame, FrameSequence, PointCloud
 from extrap_train.errors import InputError
 from extrap_train.geometry.lens import Lens, undistort
 from extrap_train.views import Camera, View, stack_poses
-
-
-@dataclass(frozen=True, slots=True)
-class DepthFile:
-    """A depth map on disk; paths are relative to the data set's root."""
-
-    path: str
-    scale: float
-    """Scene units per unit of the file."""
-    mask_path: str | None = None
-    """Of a picture that shows which of the depths to trust."""
-    is_half_float: bool = False
-    """Whether the 16 bits of its pixels are CO3D's float16, no whole numbers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +59,7 @@ class PhotographLoader:
         image_path = require_file(self.root / self.image_path)
         mask_path = require_file(self.root / self.mask_path) if self.mask_path else None
         image, mask = read_photograph(image_path, size, mask_path)
-        found = self._read_depth(self.depth, size) if depth and self.depth else None
+        found = self.depth.read(self.root, size) if depth and self.depth else None
         return View(
             image=self._straighten(image.permute(1, 2, 0)).permute(2, 0, 1).contiguous(),
             camera=self.camera,
@@ -89,16 +71,6 @@ class PhotographLoader:
     def _files(self) -> tuple[Path, ...]:
         depth = (self.depth.path, self.depth.mask_path) if self.depth else ()
         return tuple(self.root / p for p in (self.image_path, self.mask_path, *depth) if p)
-
-    def _read_depth(self, file: DepthFile, size: tuple[int, int]) -> Float[Tensor, "h w"]:
-        path = require_file(self.root / file.path)
-        if file.is_half_float:
-            depth = known_depth(read_sixteen_bit(path, size).view(np.float16), file.scale, path)
-        else:
-            depth = read_depth(path, size, file.scale)
-        if file.mask_path:
-            depth *= read_depth_mask(require_file(self.root / file.mask_path), size)
-        return depth
 
     def _straighten(self, picture: Tensor, nearest: bool = False) -> Tensor:
         if self.lens is None or self.pinhole is None:

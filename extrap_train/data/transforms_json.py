@@ -10,12 +10,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrap_train.data.camera_check import OPENGL_POSES
+from extrap_train.data.depth_files import DepthFile
 from extrap_train.data.json_files import read_json, require_dict, require_list
 from extrap_train.data.lens_keys import LENS_KEYS, lens_of, merge_entry, number_of
 from extrap_train.data.listed_files import ListedFiles
 from extrap_train.data.paths import check_relative
 from extrap_train.data.photographs import (
-    DepthFile,
     Listed,
     Photograph,
     pinhole_camera,

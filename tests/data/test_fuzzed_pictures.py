@@ -21,12 +21,10 @@ import pytest
 from PIL import Image
 
 from benchmarks.protocol.array_files import array_of, pictures_of
+from extrap_train.data.depth_files import read_depth, read_depth_mask, read_sixteen_bit
 from extrap_train.data.images import (
-    read_depth,
-    read_depth_mask,
     read_mask,
     read_photograph,
-    read_sixteen_bit,
 )
 from extrap_train.data.picture_files import image_size
 from extrap_train.errors import InputError

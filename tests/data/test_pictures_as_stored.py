@@ -11,12 +11,10 @@ import torch
 from PIL import Image
 
 from extrap_train.data import picture_files
+from extrap_train.data.depth_files import read_depth, read_depth_mask, read_sixteen_bit
 from extrap_train.data.images import (
-    read_depth,
-    read_depth_mask,
     read_mask,
     read_photograph,
-    read_sixteen_bit,
 )
 from extrap_train.data.picture_files import FORMATS, image_size, same_view
 from extrap_train.errors import InputError

@@ -14,8 +14,9 @@ from jaxtyping import Bool, Shaped
 
 from extrap_train.data.camera_check import degenerate_camera, fits_photograph
 from extrap_train.data.co3d.annotations import VIEWPOINT, FrameAnnotation
+from extrap_train.data.depth_files import DepthFile
 from extrap_train.data.paths import file_stamp
-from extrap_train.data.photographs import DepthFile, PhotographLoader
+from extrap_train.data.photographs import PhotographLoader
 from extrap_train.data.sequences import Frame
 from extrap_train.geometry.pytorch3d import NdcFormat, Viewpoint, camera_from_viewpoint
 from extrap_train.views import Camera

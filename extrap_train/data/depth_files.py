@@ -1,0 +1,111 @@
+"""Depth maps on disk to depth in scene units: CO3D's half floats, 16-bit pictures, TIFF and NPY."""
+
+import tokenize
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Shaped
+from torch import Tensor
+
+from extrap_train.data.images import nearest_pixels, read_grey, require_mode
+from extrap_train.data.paths import require_file
+from extrap_train.data.picture_files import MAX_PIXELS, read_turned, same_view
+from extrap_train.errors import InputError
+
+ARRAY_ERRORS = (
+    *(OSError, EOFError, ValueError, TypeError, SyntaxError, ArithmeticError),
+    *(RecursionError, MemoryError, tokenize.TokenError),
+)
+"""What NumPy raises on damaged NPY files."""
+MAX_DEPTH_SCALE = 1e6
+"""Scene units per unit of a depth file; a larger one is damage."""
+
+_SIXTEEN_BIT_MODES = ("I;16", "I;16B")
+_DEPTH_MODES = (*_SIXTEEN_BIT_MODES, "I", "F")
+
+
+@dataclass(frozen=True, slots=True)
+class DepthFile:
+    """A depth map on disk; paths are relative to the data set's root."""
+
+    path: str
+    scale: float
+    """Scene units per unit of the file."""
+    mask_path: str | None = None
+    """Of a picture that shows which of the depths to trust."""
+    is_half_float: bool = False
+    """Whether the 16 bits of its pixels are CO3D's float16, no whole numbers."""
+
+    def read(self, root: Path, size: tuple[int, int]) -> Float[Tensor, "h w"]:
+        """The depth in scene units at `size` (height, width); 0 where unknown or not trusted."""
+        path = require_file(root / self.path)
+        if self.is_half_float:
+            depth = known_depth(read_sixteen_bit(path, size).view(np.float16), self.scale, path)
+        else:
+            depth = read_depth(path, size, self.scale)
+        if self.mask_path:
+            depth *= read_depth_mask(require_file(root / self.mask_path), size)
+        return depth
+
+
+def read_depth(path: Path, size: tuple[int, int], scale: float) -> Float[Tensor, "h w"]:
+    """A depth map, times `scale`: greyscale of 16 bits, a TIFF of 32, or an NPY array.
+
+    0 is unknown. A map of the same shape as `size` is resampled to it, from the nearest pixels.
+    """
+    if path.suffix.lower() == ".npy":
+        raw = _read_npy(path, size)
+    else:
+        raw = np.asarray(require_mode(read_turned(path, size, same_view), _DEPTH_MODES, path))
+    return known_depth(nearest_pixels(raw, size), scale, path)
+
+
+def read_sixteen_bit(path: Path, size: tuple[int, int]) -> Shaped[np.ndarray, "h w"]:
+    """The raw values, uint16, of a greyscale PNG of 16 bits a pixel, resampled to `size`."""
+    picture = require_mode(read_turned(path, size, same_view), _SIXTEEN_BIT_MODES, path)
+    return nearest_pixels(np.asarray(picture).astype(np.uint16), size)
+
+
+def read_depth_mask(path: Path, size: tuple[int, int]) -> Float[Tensor, "h w"]:
+    """1 where the depth of a pixel is to be trusted, else 0; may be 0 everywhere."""
+    return torch.from_numpy(read_grey(path, size) > 0).float()
+
+
+def known_depth(raw: Shaped[np.ndarray, "h w"], scale: float, path: Path) -> Float[Tensor, "h w"]:
+    """`raw` × `scale`, 0 where that is not positive and finite.
+
+    An empty map, and a scale that cannot be, is an error that names `path`.
+    """
+    if not 0 < scale < MAX_DEPTH_SCALE:
+        raise InputError(
+            f"{path}: the scale of its depth is {scale}, no possible one; correct its entry or "
+            "estimate depth (depth=stereo)"
+        )
+    with np.errstate(invalid="ignore", over="ignore"):
+        depth = raw.astype(np.float32) * np.float32(scale)
+    depth[~(np.isfinite(depth) & (depth > 0))] = 0
+    if not depth.any():
+        raise InputError(
+            f"{path}: the depth map is zero everywhere; remove it or its frame, or estimate depth "
+            "(depth=stereo)"
+        )
+    return torch.from_numpy(depth)
+
+
+def _read_npy(path: Path, size: tuple[int, int]) -> Shaped[np.ndarray, "h w"]:
+    require_file(path)
+    try:
+        # Mapped, not read: the header may promise any size.
+        raw: np.ndarray = np.lib.format.open_memmap(path, mode="r")
+    except ARRAY_ERRORS as error:
+        raise InputError(f"{path}: is no array of numbers ({error}); restore it") from None
+    if raw.ndim == 3 and raw.shape[2] == 1:
+        raw = raw[..., 0]
+    fits = raw.ndim == 2 and 0 < raw.size <= MAX_PIXELS and same_view(raw.shape, size)
+    if not fits or raw.dtype.kind not in "fiu":
+        raise InputError(
+            f"{path}: is an array of {raw.dtype} {raw.shape}, expected numbers {size}; restore it"
+        )
+    return np.asarray(raw)
