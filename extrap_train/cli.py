@@ -4,6 +4,7 @@ is wrong.
 
 import contextlib
 import errno
+import functools
 import io
 import os
 import sys
@@ -48,6 +49,7 @@ TRAIN = CommandOptions(
 PREP = CommandOptions("python -m data_prep", "prep", DataPrepConfig, {})
 
 
+@functools.cache
 def register_schemas() -> None:
     """Make the dataclasses known to Hydra, as `<name>_schema`."""
     store = ConfigStore.instance()

@@ -2,7 +2,7 @@
 its result.
 """
 
-import io
+import importlib
 import json
 import os
 import shutil
@@ -10,11 +10,13 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import redirect_stdout
+from multiprocessing.context import ForkServerContext
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
+from in_process import run_command
 from tiny_job import TINY
 
 from extrap_train.__main__ import main
@@ -34,10 +36,8 @@ def _arguments(output: Path, *more: str) -> list[str]:
     return [*_OPTIONS, f"output={output}", *more]
 
 
-def _start(
-    output: Path, program: tuple[str, str] = ("-m", "extrap_train")
-) -> "subprocess.Popen[bytes]":
-    command = [sys.executable, *program, *_arguments(output)]
+def _start(output: Path) -> "subprocess.Popen[bytes]":
+    command = [sys.executable, "-m", "extrap_train", *_arguments(output)]
     environment = os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     with (output / "log.txt").open("wb") as log:
         return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
@@ -49,10 +49,7 @@ def _said(output: Path) -> str:
 
 def _finish(output: Path, *more: str) -> str:
     """Run the job in this process, to its end."""
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()) as said:
-        patch.setattr(sys, "argv", ["extrap_train", *_arguments(output, *more)])
-        main()
-    return said.getvalue()
+    return run_command(main, *_arguments(output, *more))
 
 
 @pytest.fixture(scope="module")
@@ -118,22 +115,22 @@ def test_a_finished_run_is_measured_again_sampled_otherwise(
     assert (run / "summary.json").read_bytes() == before
 
 
-_KILLED_WITHIN = """
-import os, signal, sys
-from extrap_train.__main__ import main
-from {module} import {owner} as owner
+def _run_until_killed(output: Path, module: str, owner: str, name: str, where: str) -> None:
+    """A job that kills itself where `module.owner.name(…)` is called, of a file half-written if it
+    saves one, and one of the arguments says `where`.
+    """
+    holder = getattr(importlib.import_module(module), owner)
+    really = getattr(holder, name)
 
-def killed(*arguments, **options):
-    if "{where}" in str(arguments):
-        if "{name}" == "save":
-            open(arguments[1], "wb").write(b"half")
-        os.kill(os.getpid(), signal.SIGKILL)
-    return really(*arguments, **options)
+    def killed(*arguments: Any, **options: Any) -> Any:
+        if where in str(arguments):
+            if name == "save":
+                Path(arguments[1]).write_bytes(b"half")
+            os.kill(os.getpid(), signal.SIGKILL)
+        return really(*arguments, **options)
 
-really, owner.{name} = owner.{name}, killed
-main()
-"""
-"""A job that kills itself where a function is called, of a file half-written if it saves one."""
+    setattr(holder, name, killed)
+    _finish(output)
 
 
 def _kill_at_file(output: Path, pattern: str) -> None:
@@ -146,14 +143,11 @@ def _kill_at_file(output: Path, pattern: str) -> None:
     process.wait()
 
 
-def _kill_within(output: Path, module: str, owner: str, name: str, where: str) -> None:
-    """Start a job that kills itself within `module.owner.name(…)`, of whose arguments one says
-    `where`.
-    """
-    script = _KILLED_WITHIN.format(module=module, owner=owner, name=name, where=where)
-    process = _start(output, program=("-c", script))
-    process.wait(timeout=300)
-    assert process.returncode == -signal.SIGKILL, _said(output)
+def _kill_within(server: ForkServerContext, output: Path, *place: str) -> None:
+    process = server.Process(target=_run_until_killed, args=(output, *place))
+    process.start()
+    process.join(timeout=300)
+    assert process.exitcode == -signal.SIGKILL
 
 
 _WITHIN_CHECKPOINT = ("extrap_train.diffusion.checkpoints", "torch", "save", "step-00000006")
@@ -165,24 +159,26 @@ def _checkpoints(output: Path) -> list[str]:
 
 
 def test_killed_within_a_checkpoint_the_weights_are_the_same(
-    undisturbed: Path, tmp_path: Path
+    fork_server: ForkServerContext, undisturbed: Path, tmp_path: Path
 ) -> None:
     """SIGKILL with half of the checkpoint written; then run to the end."""
     _link_data(undisturbed, tmp_path)
-    _kill_within(tmp_path, *_WITHIN_CHECKPOINT)
+    _kill_within(fork_server, tmp_path, *_WITHIN_CHECKPOINT)
     assert _checkpoints(tmp_path) == ["step-00000003.ckpt"], "killed within writing the second"
     _finish(tmp_path)
     _require_same(tmp_path, undisturbed)
 
 
 @pytest.mark.slow
-def test_killed_again_and_again_the_weights_are_the_same(undisturbed: Path, tmp_path: Path) -> None:
+def test_killed_again_and_again_the_weights_are_the_same(
+    fork_server: ForkServerContext, undisturbed: Path, tmp_path: Path
+) -> None:
     """SIGKILL while sequences are rendered, within the writing of a checkpoint, within the
     validation behind it, and right after the last one; then run to the end.
     """
     _kill_at_file(tmp_path, "synthetic/hydrant/0000/**/*.jpg")
-    _kill_within(tmp_path, *_WITHIN_CHECKPOINT)
-    _kill_within(tmp_path, *_WITHIN_VALIDATION)
+    _kill_within(fork_server, tmp_path, *_WITHIN_CHECKPOINT)
+    _kill_within(fork_server, tmp_path, *_WITHIN_VALIDATION)
     assert not (_run_folder(tmp_path) / "metrics.csv").read_text().count("validation/")
     _kill_at_file(tmp_path, "train/hydrant/small/*/checkpoints/step-00000012.ckpt")
     _finish(tmp_path)

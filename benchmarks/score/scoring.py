@@ -11,7 +11,6 @@ from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
-from torchmetrics.functional.image import structural_similarity_index_measure
 
 from benchmarks.protocol.array_files import array_of, pictures_of
 from benchmarks.protocol.prepared_scene import Scene, Truth
@@ -181,6 +180,9 @@ def megascenes_compat(images: Float[Tensor, "n 3 h w"], truth: Truth) -> dict[st
     error is over all pixels, not those of the mask, and pooled over the images before the
     logarithm. Scores are higher the less a warp covers.
     """
+    # It loads transformers, for which a dry run need not wait.
+    from torchmetrics.functional.image import structural_similarity_index_measure
+
     made, true = ((2 * pictures - 1) * truth.warps for pictures in (images, truth.images))
     error = float((made - true).square().mean())
     similarity = structural_similarity_index_measure(made, true, data_range=2.0)

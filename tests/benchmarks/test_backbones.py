@@ -26,6 +26,8 @@ from extrap_train.errors import InputError
 from extrap_train.metrics import BACKBONES, dists_distance, lpips_distance
 from tests.benchmarks.tables import greys_folder, run_greys
 
+_ONE_ROW = ("methods=[dark]", "scoring.lpips=[squeeze]")
+
 
 @pytest.fixture
 def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
@@ -54,7 +56,7 @@ def put_backbone(hub: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[int], 
 
 
 def _scored(own: Path, output: Path) -> dict[str, tuple[float | None, float]]:
-    assert run_greys(own, output, "scoring.lpips=[squeeze]", quick=True) == 0
+    assert run_greys(own, output, *_ONE_ROW, quick=True) == 0
     cells = read_results(greys_folder(output)).cells
     return {c.method: (c.metrics["lpips_squeeze"].value, c.seconds) for c in cells}
 
@@ -66,15 +68,15 @@ def test_a_backbone_put_into_the_hub_cache_is_used_by_the_next_run(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     before = _scored(own, tmp_path)
-    run_greys(own, tmp_path, "scoring.lpips=[squeeze]", quick=True, dry_run=True)
+    run_greys(own, tmp_path, *_ONE_ROW, quick=True, dry_run=True)
     said = " ".join(capsys.readouterr().out.split())
     assert "lpips_squeeze stays empty: LPIPS (squeeze) has no weights" in said
     put_backbone(0)
     first = _scored(own, tmp_path)
-    assert "0 reused, 2 open" in capsys.readouterr().out
-    run_greys(own, tmp_path, "scoring.lpips=[squeeze]", quick=True, dry_run=True)
+    assert "0 reused, 1 open" in capsys.readouterr().out
+    run_greys(own, tmp_path, *_ONE_ROW, quick=True, dry_run=True)
     said = capsys.readouterr().out
-    assert "2 reused, 0 open" in said
+    assert "1 reused, 0 open" in said
     assert "stays empty" not in said
     put_backbone(1)
     second = _scored(own, tmp_path)
@@ -116,14 +118,14 @@ def test_verification_judges_with_the_very_weights_or_says_that_it_did_not(
 ) -> None:
     weights = tmp_path / "lpips.pt"
     torch.save(lpips.LPIPS(net="squeeze", pnet_rand=True, verbose=False).state_dict(), weights)
-    words = ["scoring.lpips=[squeeze]", f"scoring.lpips_weights.squeeze={weights}"]
+    words = [*_ONE_ROW, f"scoring.lpips_weights.squeeze={weights}"]
     assert run_greys(own, tmp_path, *words, quick=True) == 0
     folder = greys_folder(tmp_path)
-    assert verify(folder) == Verification(cells=2, apart=2)
+    assert verify(folder) == Verification(cells=1, apart=1)
     moved = weights.rename(tmp_path / "elsewhere.pt")
     here = {"lpips_squeeze": "its weights are not here; give scoring.lpips_weights.squeeze=FILE"}
-    assert verify(folder) == Verification(cells=2, apart=2, unchecked=here)
-    assert verify(folder, {"squeeze": str(moved)}) == Verification(cells=2, apart=2)
+    assert verify(folder) == Verification(cells=1, apart=1, unchecked=here)
+    assert verify(folder, {"squeeze": str(moved)}) == Verification(cells=1, apart=1)
     put_backbone(0)
     assert "not those" in verify(folder).unchecked["lpips_squeeze"]
     capsys.readouterr()

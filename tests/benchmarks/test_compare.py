@@ -1,14 +1,20 @@
 """What is said of a change: only what enough captures bear out, and who judged."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from benchmarks.__main__ import main
+from benchmarks.report.aggregate import Results, read_results
 from benchmarks.report.compare import compare
+from extrap_train.errors import InputError
 from tests.benchmarks.made import cell, results
+from tests.benchmarks.tables import greys_folder, run_greys
 
 
 def _verdict(change: np.ndarray, metric: str = "psnr") -> Any:
@@ -50,3 +56,58 @@ def test_other_judges_are_noted_row_by_row() -> None:
     found = rows.set_index(["method", "metric"])["scoring"]
     expected = {("a", "psnr"): "other", ("a", "seconds"): "same", ("b", "psnr"): "same"}
     pd.testing.assert_series_equal(found[list(expected)], pd.Series(expected), check_names=False)
+
+
+def _results(output: Path) -> Results:
+    return read_results(greys_folder(output))
+
+
+def test_compare_pairs_cells(own: Path, finished: Path, copy: Path) -> None:
+    same = compare(_results(finished), _results(copy))
+    assert (same[same["metric"] == "psnr"]["verdict"] == "the same").all()
+    run_greys(own, copy, "options.dark.level=0.45")
+    changed = compare(_results(finished), _results(copy)).set_index(["method", "metric"])
+    row = changed.loc[("dark", "psnr")]
+    assert row["verdict"] == "too few captures to tell"
+    assert row["captures"] == 2
+    assert row["difference"] == pytest.approx(row["after"] - row["before"])
+    assert changed.loc[("light", "psnr")]["verdict"] == "the same"
+    assert (changed["scoring"] == "same").all()
+
+
+def test_compare_notes_another_scoring(
+    own: Path, finished: Path, copy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_greys(own, copy, "scoring.lpips=[squeeze]")
+    rows = compare(_results(finished), _results(copy)).set_index("metric")
+    assert set(rows.loc["psnr", "scoring"]) == {"other"}
+    assert set(rows.loc["seconds", "scoring"]) == {"same"}
+    capsys.readouterr()
+    assert main(["compare", str(finished / "greys"), str(copy / "greys")]) == 0
+    assert "note: where scoring is `other`" in capsys.readouterr().err
+    assert main(["compare", str(copy / "greys"), str(copy / "greys")]) == 0
+    assert not capsys.readouterr().err
+
+
+def test_compare_keeps_draws_apart_and_refuses_other_photographs(
+    own: Path, finished: Path, copy: Path, tmp_path: Path
+) -> None:
+    draws = "draws=[random,spread]"
+    assert run_greys(own, copy, draws, quick=True) == 0
+    same = compare(_results(copy), _results(copy)).query("metric == 'psnr'")
+    assert list(same["draw"]) == ["random", "random", "spread", "spread"]
+    assert list(same["captures"]) == [1, 1, 1, 1]
+    assert run_greys(own, tmp_path / "other", "captures.render_size=32", quick=True) == 0
+    with pytest.raises(
+        InputError, match=r"different photographs or cameras of apple-0000-3-random"
+    ):
+        compare(_results(finished), _results(tmp_path / "other"))
+
+
+def test_compare_refuses_a_cell_that_does_not_say_what_it_was_made_from(copy: Path) -> None:
+    record = next(copy.glob("greys/cells/*/cell.json"))
+    content = json.loads(record.read_text())
+    del content["made_from"]["inputs"]["photographs"]
+    record.write_text(json.dumps(content))
+    with pytest.raises(InputError, match="photographs"):
+        compare(_results(copy), _results(copy))

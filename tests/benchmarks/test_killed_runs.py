@@ -31,8 +31,7 @@ def _table(output: Path) -> pd.DataFrame:
 def test_a_worker_that_is_killed_is_a_failed_cell_and_the_rest_goes_on(
     own: Path, tmp_path: Path
 ) -> None:
-    failed = run_greys(own, tmp_path, "methods=[dark,killer,light]", workers=2)
-    assert failed == 2  # captures
+    assert run_greys(own, tmp_path, "methods=[dark,killer,light]", workers=2, quick=True) == 1
     table = _table(tmp_path)
     states = table.groupby("method")["status"].first()
     assert dict(states) == {"dark": "ok", "killer": "failed", "light": "ok"}

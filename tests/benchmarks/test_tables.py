@@ -13,8 +13,7 @@ import pytest
 from benchmarks.__main__ import main
 from benchmarks.catalogue import Catalogue
 from benchmarks.protocol.prepared_scene import Scene
-from benchmarks.report.aggregate import TIDY, Results, read_results
-from benchmarks.report.compare import compare
+from benchmarks.report.aggregate import TIDY, read_results
 from benchmarks.run import run_method
 from benchmarks.run.method_content import MethodContent
 from benchmarks.run.plan import cell_jobs, open_protocol
@@ -257,61 +256,6 @@ def test_the_version_is_the_packages(capsys: pytest.CaptureFixture[str]) -> None
     assert capsys.readouterr().out == f"extrap-train {version('extrap-train')}\n"
 
 
-def _results(output: Path) -> Results:
-    return read_results(greys_folder(output))
-
-
-def test_compare_pairs_cells(own: Path, finished: Path, copy: Path) -> None:
-    same = compare(_results(finished), _results(copy))
-    assert (same[same["metric"] == "psnr"]["verdict"] == "the same").all()
-    run_greys(own, copy, "options.dark.level=0.45")
-    changed = compare(_results(finished), _results(copy)).set_index(["method", "metric"])
-    row = changed.loc[("dark", "psnr")]
-    assert row["verdict"] == "too few captures to tell"
-    assert row["captures"] == 2
-    assert row["difference"] == pytest.approx(row["after"] - row["before"])
-    assert changed.loc[("light", "psnr")]["verdict"] == "the same"
-    assert (changed["scoring"] == "same").all()
-
-
-def test_compare_notes_another_scoring(
-    own: Path, finished: Path, copy: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run_greys(own, copy, "scoring.lpips=[squeeze]")
-    rows = compare(_results(finished), _results(copy)).set_index("metric")
-    assert set(rows.loc["psnr", "scoring"]) == {"other"}
-    assert set(rows.loc["seconds", "scoring"]) == {"same"}
-    capsys.readouterr()
-    assert main(["compare", str(finished / "greys"), str(copy / "greys")]) == 0
-    assert "note: where scoring is `other`" in capsys.readouterr().err
-    assert main(["compare", str(copy / "greys"), str(copy / "greys")]) == 0
-    assert not capsys.readouterr().err
-
-
-def test_compare_keeps_draws_apart_and_refuses_other_photographs(
-    own: Path, finished: Path, copy: Path, tmp_path: Path
-) -> None:
-    draws = "draws=[random,spread]"
-    assert run_greys(own, copy, draws, quick=True) == 0
-    same = compare(_results(copy), _results(copy)).query("metric == 'psnr'")
-    assert list(same["draw"]) == ["random", "random", "spread", "spread"]
-    assert list(same["captures"]) == [1, 1, 1, 1]
-    assert run_greys(own, tmp_path / "other", "captures.render_size=32", quick=True) == 0
-    with pytest.raises(
-        InputError, match=r"different photographs or cameras of apple-0000-3-random"
-    ):
-        compare(_results(finished), _results(tmp_path / "other"))
-
-
-def test_compare_refuses_a_cell_that_does_not_say_what_it_was_made_from(copy: Path) -> None:
-    record = next(copy.glob("greys/cells/*/cell.json"))
-    content = json.loads(record.read_text())
-    del content["made_from"]["inputs"]["photographs"]
-    record.write_text(json.dumps(content))
-    with pytest.raises(InputError, match="photographs"):
-        compare(_results(copy), _results(copy))
-
-
 def test_two_runs_on_one_folder_do_not_mix(own: Path, copy: Path) -> None:
     from filelock import FileLock
 
@@ -339,6 +283,7 @@ def test_means_hold_their_interval(finished: Path) -> None:
     assert np.isnan(means[means["metric"] == "coverage"]["rank"]).all()
 
 
+@pytest.mark.slow  # its two tasks load for longer than they run
 def test_a_cluster_makes_the_same_table(own: Path, finished: Path, tmp_path: Path) -> None:
     """The code that submits to SLURM, with submitit's own executor for a machine without it."""
     import submitit
