@@ -1,7 +1,7 @@
 """A scene's posed views as a model takes them: framed, sized and with depth."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from extrap_train.data.sequences import Frame, FrameSequence
-from extrap_train.data.square_frames import make_frames, object_square
+from extrap_train.data.square_frames import load_readable, make_frames, object_square
 from extrap_train.depth import DepthSource
 from extrap_train.errors import InputError, did_you_mean
 from extrap_train.geometry.viewpoints import camera_centers, farthest_point_sample
@@ -66,20 +66,15 @@ def input_views(
 
 def target_views(frames: Sequence[Frame], size: int) -> list[View]:
     """Frames framed in the same way, without depth: what a generated view is compared with."""
-    return [object_square(view, size) for view in load_readable(frames)]
+    return [object_square(view, size) for view in load_held_out(frames)]
 
 
-def load_readable(frames: Sequence[Frame]) -> list[View]:
+def load_held_out(frames: Sequence[Frame]) -> Iterator[View]:
     """The photographs without depth; those that cannot be read are left out with a warning."""
-    views, reasons = [], []
-    for frame in frames:
-        try:
-            views.append(replace(frame.load(depth=False), name=frame.name))
-        except InputError as error:
-            reasons.append(str(error))
+    reasons: list[str] = []
+    yield from load_readable(frames, reasons, depth=False)
     if reasons:
         LOG.warning("%d held-out photographs are left out: %s", len(reasons), reasons[0])
-    return views
 
 
 def _unit(pixels: UInt8[np.ndarray, "..."]) -> Float[Tensor, "..."]:

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +14,7 @@ from torch import Tensor
 from extrap_train.data.frame_files import SequenceFrames
 from extrap_train.data.images import to_eight_bits
 from extrap_train.data.paths import file_stamp
-from extrap_train.data.sequences import FrameSequence
+from extrap_train.data.sequences import Frame, FrameSequence
 from extrap_train.depth import DepthSource, NoDepthError
 from extrap_train.errors import InputError
 from extrap_train.views import View, stack_cameras
@@ -115,17 +115,30 @@ def _remedy(source: DepthSource) -> str:
 
 
 def _usable_views(sequence: FrameSequence, where: str, size: int, *, depth: bool) -> list[View]:
-    views, reasons = [], list(sequence.left_out)
-    for frame in sequence.frames:
+    reasons = list(sequence.left_out)
+    whole = load_readable(sequence.frames, reasons, depth=depth)
+    views = [object_square(view, size) for view in whole]
+    require_few_unusable(reasons, sequence, where)
+    return views
+
+
+def load_readable(frames: Iterable[Frame], reasons: list[str], *, depth: bool) -> Iterator[View]:
+    """The frames that can be read, one at a time; why the others cannot is added to `reasons`."""
+    for frame in frames:
         try:
-            views.append(replace(object_square(frame.load(depth=depth), size), name=frame.name))
+            view = replace(frame.load(depth=depth), name=frame.name)
         except InputError as error:
             reasons.append(str(error))
+        else:
+            yield view
+
+
+def require_few_unusable(reasons: Sequence[str], sequence: FrameSequence, where: str) -> None:
+    """Warn of a sequence's unusable frames, one reason each; InputError where they are too many."""
     if too_many := too_many_unusable(reasons, sequence):
         raise InputError(f"{where}: {too_many}")
     if reasons:
         LOG.warning("%s: %d frames left out: %s", where, len(reasons), reasons[0])
-    return views
 
 
 def too_many_unusable(reasons: Sequence[str], sequence: FrameSequence) -> str:

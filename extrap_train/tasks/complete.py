@@ -1,6 +1,5 @@
 """`task=complete`: from a few posed photographs of a scene to a full turn around it."""
 
-import logging
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -22,7 +21,7 @@ from extrap_train.config import (
 from extrap_train.data.photographs import CATEGORY
 from extrap_train.data.scene_spec import SYNTHETIC_SCHEME, open_scene
 from extrap_train.data.sequences import Frame, FrameSequence
-from extrap_train.data.square_frames import too_many_unusable
+from extrap_train.data.square_frames import load_readable, require_few_unusable
 from extrap_train.data.synthetic import SyntheticScene, build_scene
 from extrap_train.depth.sources import depth_source
 from extrap_train.device import advise_on_sampling_memory
@@ -71,8 +70,6 @@ from extrap_train.tasks.scene_model import (
 )
 from extrap_train.terminal import progress, terminal
 from extrap_train.views import stack_cameras, stack_poses
-
-LOG = logging.getLogger(__name__)
 
 _NOT_PART_OF_THE_MAP = (
     "dry_run",
@@ -159,24 +156,16 @@ def _job(config: TrainConfig) -> _Job:
 
 def _readable(config: TrainConfig, sequence: FrameSequence, inputs: list[int]) -> list[int]:
     """The inputs without those whose files cannot be read; InputError if named, or too many."""
+    frames = [sequence.frames[index] for index in inputs]
+    photographs = [frame for frame in frames if frame.files]  # others are rendered
+    reasons: list[str] = []
     depth = isinstance(config.depth, DatasetDepthConfig)
-    readable, reasons = [], []
-    for index in inputs:
-        frame = sequence.frames[index]
-        try:
-            if frame.files:
-                frame.load(depth=depth)
-            readable.append(index)
-        except InputError as error:
-            if config.input_frames:
-                raise
-            reasons.append(str(error))
-    part = replace(sequence, frames=[sequence.frames[i] for i in inputs], left_out=())
-    if too_many := too_many_unusable(reasons, part):
-        raise InputError(f"scene {config.scene}: {too_many}")
-    if reasons:
-        LOG.warning("%d input photographs are left out: %s", len(reasons), reasons[0])
-    return readable
+    readable = {view.name for view in load_readable(photographs, reasons, depth=depth)}
+    if reasons and config.input_frames:
+        raise InputError(reasons[0])
+    part = replace(sequence, frames=frames, left_out=())
+    require_few_unusable(reasons, part, f"scene {config.scene}: inputs")
+    return [i for i, f in zip(inputs, frames, strict=True) if f.name in readable or not f.files]
 
 
 def _check_category(config: TrainConfig, sequence: FrameSequence) -> None:

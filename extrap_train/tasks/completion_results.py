@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from extrap_train.config import TrainConfig
-from extrap_train.data.scene_views import load_readable
+from extrap_train.data.scene_views import load_held_out
 from extrap_train.data.sequences import Frame, FrameSequence
 from extrap_train.data.synthetic import SyntheticScene
 from extrap_train.gaussians.fit import Diverged
@@ -197,7 +197,7 @@ def _compare_held_out(
     if not frames or config.complete.generator == "exact":
         return None, {}
     size = pipeline.generator.image_size
-    truth = [view.squared(size) for view in load_readable(frames)]
+    truth = [view.squared(size) for view in load_held_out(frames)]
     if not truth:
         return None, {}
     cameras = [done.world.inside(view.camera) for view in truth]

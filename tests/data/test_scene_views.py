@@ -7,7 +7,6 @@ from orbits import capture, even, ring
 
 from extrap_train.data.scene_views import (
     input_views,
-    load_readable,
     select_input_frames,
     target_views,
 )
@@ -60,5 +59,5 @@ def test_more_bad_frames_are_too_many(count, broken):
 def test_a_bad_held_out_photograph_is_left_out(caplog):
     frames = capture(ring(even(4)), broken=(2,)).frames
     assert [view.name for view in target_views(frames, 16)] == ["frame0", "frame1", "frame3"]
-    assert load_readable(frames[2:3]) == []
+    assert target_views(frames[2:3], 16) == []
     assert "frame2.jpg: truncated" in caplog.text
