@@ -34,7 +34,7 @@ _DAMAGE = (
     struct.error,
     zipfile.BadZipFile,
 )
-"""What torch raises on files that are cut off or are none of its own."""
+"""What torch raises on files that are cut off or not torch's."""
 _MAX_PICKLE_BYTES = 16 * 2**20
 """Of the table beside the tensors; that of Stable Diffusion's two thousand has 0.3 MiB."""
 
@@ -72,7 +72,7 @@ class WeightFile:
         try:
             if self.path.suffix == ".safetensors":
                 return load_file(self.path)
-            zipped = self.path.open("rb").read(4) == b"PK\3\4"  # what torch goes by
+            zipped = self.path.open("rb").read(4) == b"PK\3\4"  # how torch tells the formats apart
             if zipped:
                 self._require_uncompressed()
             with safe_globals([(Inert, name) for name in inert]):

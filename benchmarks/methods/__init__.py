@@ -1,1 +1,1 @@
-"""The methods that a table compares, one file a method, all behind `base.Method`."""
+"""The methods that a table compares, one file per method, all behind `base.Method`."""

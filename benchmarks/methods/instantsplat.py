@@ -23,7 +23,7 @@ _STEADY, _LOOSE = 1.0, 100.0
 
 @dataclass(frozen=True)
 class InstantSplat(GaussianMethod):
-    """A point a pixel, no growth, quick learning rates, joint pose refinement."""
+    """One point per pixel, no densification, high learning rates, joint pose refinement."""
 
     full_iterations: int = 1000
     init: str = "dense"

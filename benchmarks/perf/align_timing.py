@@ -59,7 +59,7 @@ NOISES: dict[str, Noise] = {
 
 
 def run() -> list[Row]:
-    """One row a kind of noise; the case names both mean relative depth errors."""
+    """One row per kind of noise; the case names both mean relative depth errors."""
     return [_compare(name, noise) for name, noise in NOISES.items()]
 
 

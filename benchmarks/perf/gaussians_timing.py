@@ -33,7 +33,7 @@ Draw = Callable[..., Float[Tensor, "h w 3"]]
 
 
 def run() -> list[Row]:
-    """One row a number of Gaussians and an image size; with gsplat, too, where there is a GPU."""
+    """One row per number of Gaussians and image size; where there is a GPU, gsplat's, too."""
     backends: list[Backend] = ["numba", "gsplat"] if torch.cuda.is_available() else ["numba"]
     rows = []
     for backend in backends:

@@ -200,7 +200,7 @@ def _co3d(
 
 
 def _reconfusion(config: CapturesConfig) -> list[FrameSequence]:
-    """A folder a scene, as the split's authors hand it out; frames are counted in name order."""
+    """One folder per scene, as the split's authors publish it; frames are counted in name order."""
     if config.root is None:
         raise InputError("captures.source=reconfusion needs its folder: give captures.root=FOLDER")
     folders = sorted(file.parent for file in Path(config.root).glob(f"*/{TRANSFORMS}"))

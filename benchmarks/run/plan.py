@@ -39,12 +39,12 @@ class TableFolder:
 
     @property
     def cells(self) -> Path:
-        """A folder a cell."""
+        """One folder per cell."""
         return self.path / "cells"
 
     @property
     def scenes(self) -> Path:
-        """A folder a prepared draw."""
+        """One folder per prepared draw."""
         return self.path / "scenes"
 
     @property

@@ -141,7 +141,7 @@ def _check_network(model: ModelConfig) -> None:
     if odd or not model.unet.channels:
         raise InputError(f"model.unet.channels={model.unet.channels}: need multiples of {groups}")
     if model.vae is not None and not model.vae.channels:
-        raise InputError("model.vae.channels=[]: need a width a level")
+        raise InputError("model.vae.channels=[]: give one width per level")
     for part, channels in (
         ("unet", model.unet.channels),
         ("vae", model.vae.channels if model.vae else []),

@@ -50,7 +50,7 @@ LENS_KEYS |= {"cx", "cy"}
 
 
 def merge_entry(common: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
-    """A frame's keys upon those of all frames; its own spelling of a thing replaces another's."""
+    """The keys of all frames, overridden by a frame's own, whichever way they are spelt."""
     hidden: set[str] = set()
     for spellings in _SPELLINGS:
         said = [keys for keys in spellings if any(key in frame for key in keys)]

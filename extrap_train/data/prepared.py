@@ -1,9 +1,9 @@
 """Prepared data on disk, as training reads it: pairs, cameras, and memory-mapped frames.
 
 <folder>/manifest.json       what it was made from; written last: marks a finished preparation
-         sequences.parquet   a row a sequence, the dropped ones too, with reasons
-         frames.parquet      a row a frame: name, camera, whether it may serve as a reference
-         pairs.parquet       a row an ordered pair (reference → query)
+         sequences.parquet   one row per sequence, dropped ones with their reason
+         frames.parquet      one row per frame: name, camera, whether it may serve as a reference
+         pairs.parquet       one row per ordered pair (reference → query)
          split.json          test sequences (or frames), with a hash
 <frames>/frames/<category>/<sequence>/{images,depth,mask}.npy, frames.parquet
          lone_frames/…       of a sequence that is trained and tested on, with frames held out
@@ -127,7 +127,7 @@ class PreparedData:
         self.folder = folder
         self.manifest = manifest
         self.sequences = sequences
-        """A row a sequence: name, verdict with reason and measurements, split, number of pairs."""
+        """One row per sequence: name, verdict with reason, measurements, split, number of pairs."""
         self.image_size: int = manifest["options"]["image_size"]
         self._pairs = pairs
         self._world_to_cam = matrices_of(frames, "world_to_cam", (4, 4))

@@ -100,7 +100,7 @@ def adaptation_pairs(
 class ScenePairs(AdaptationPairs):
     """All N(N − 1) pairs (query, nearest reference) of N posed views.
 
-    The pair with the best score cos α·(1 − cos α), the likest to what is asked for later, is held
+    The pair with the best score cos α·(1 − cos α), the most similar to later queries, is held
     out, and with it its query: a view that is trained towards says nothing about others.
     """
 

@@ -61,7 +61,7 @@ class FrameSequence:
     frames: Sequence[Frame]
     """In the order in which they were taken."""
     left_out: tuple[str, ...] = ()
-    """Why others, which the capture lists, are none of them: a reason for each."""
+    """A reason for each frame that the capture lists and that is left out."""
     listed: tuple[str, ...] = ()
     """Names of all that the capture's description lists, those without a picture and those that are
     left out included, in order; empty where a capture has no such list."""

@@ -63,7 +63,7 @@ def adapt(
     on_step: Callable[[int, float], None] = lambda step, share: None,
     clock: Callable[[], float] = time.monotonic,
 ) -> Adaptation:
-    """Train the adapter and leave its best weights upon the model.
+    """Train the adapter and leave the model with its best weights.
 
     With virtual references the truth is learnt where they reach, and in the holes the model is held
     to what it generated before: few photographs say what surfaces look like here, but not what lies

@@ -199,7 +199,7 @@ def ddim_timesteps(schedule: DDIMScheduler, config: SamplerConfig) -> Int[Tensor
     981 with 50 steps. That holds for 50 steps or more that divide the schedule evenly. With fewer
     the stride is so long that the first timestep would no longer be close to pure noise, which is
     what sampling starts from. `compat` forces the published spacing for any number of steps and
-    drops the noisiest one; InputError where the model is none of theirs.
+    drops the noisiest one; InputError where the model is not theirs.
     """
     count, train_steps = config.steps, schedule.config["num_train_timesteps"]
     leading = torch.arange(count - 1, -1, -1) * (train_steps // count) + 1

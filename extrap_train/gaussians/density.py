@@ -52,7 +52,7 @@ class GrowthStatistics:
             setattr(self, name, torch.cat([old, old.new_zeros(added)]))
 
     def mean_gradient(self) -> Float[Tensor, " n"]:
-        """Length of the gradient in NDC, a visit; 0 for Gaussians that were not seen."""
+        """Mean length of the gradient in NDC per rendering; 0 for Gaussians that were not seen."""
         return self.gradient / self.visits.clamp_min(1)
 
 

@@ -152,8 +152,8 @@ def _procrustes(
 ) -> tuple[Float[Tensor, "e 3 3"], Float[Tensor, "e 3"], Float[Tensor, " e"]]:
     """The rotation, shift and scale of the weighted least squares (Umeyama 1991).
 
-    roma's own registration is made for many small problems; of a few large ones it takes thrice
-    the time.
+    roma's own registration is made for many small problems; a few large ones take it three times
+    as long.
     """
     share = (weight / weight.sum(-1, keepdim=True))[:, None]
     source_middle, target_middle = source @ share.mT, target @ share.mT

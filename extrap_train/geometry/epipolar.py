@@ -78,7 +78,7 @@ def steps_across(
 
 @dataclass(frozen=True)
 class Triangulated:
-    """One point a match."""
+    """One point per match."""
 
     depth: Float[Tensor, " n"]
     """In the first camera; not positive where the rays part."""

@@ -1,4 +1,4 @@
-"""One picture a query: the same whatever else is asked for, with the warp that it was made from."""
+"""One picture per query, the same whatever else is asked for, and the warp it was made from."""
 
 from dataclasses import replace
 

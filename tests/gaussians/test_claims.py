@@ -87,7 +87,7 @@ DRAWS: dict[str, Callable[[str], Task]] = {"all around": all_around, "neighbours
 
 @dataclass(frozen=True)
 class Scores:
-    """PSNR in dB by method and mask: a row a seed, the mean over the scenes."""
+    """PSNR in dB by method and mask: one row per seed, the mean over the scenes."""
 
     by_seed: Mapping[tuple[str, str], Sequence[float]]
 

@@ -1,4 +1,4 @@
-"""A saved model goes by what was saved with it; what a command says otherwise is not lost."""
+"""A saved model keeps its own options; a command's different ones are not lost."""
 
 import sys
 from collections.abc import Callable

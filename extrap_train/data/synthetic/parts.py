@@ -42,7 +42,7 @@ def placement(
 
 @dataclass(frozen=True)
 class Hits:
-    """Where rays meet surfaces; every array has one row a ray."""
+    """Where rays meet surfaces; every array has one row per ray."""
 
     face: Int[np.ndarray, " n"]
     """-1 where a ray meets nothing."""
