@@ -1,6 +1,7 @@
 """The one line with which unusable input is refused."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
@@ -14,4 +15,14 @@ def complaint_of(read: Callable[..., object], *arguments: object) -> str:
     message = str(caught.value)
     assert "\n" not in message
     assert ";" in message
+    return message
+
+
+def complaint_about(read: Callable[..., object], file: Path, *arguments: object) -> str:
+    """What `read` says of a file: one line, which begins with its path."""
+    with pytest.raises(InputError) as caught:
+        read(file, *arguments)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.startswith(str(file))
     return message
