@@ -1,9 +1,12 @@
-"""A batch that looks like a real one."""
+"""A batch that looks like a real one, and a model that is not trained."""
 
 import math
 
 import torch
+from torch import nn
 
+from extrap_train.config import ModelConfig
+from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.geometry.warp import compute_warp
 from extrap_train.views import Camera, PairBatch, stack_cameras
 
@@ -42,3 +45,11 @@ def batch_of(count: int, size: int = 32, references: int = 3, seed: int = 0) -> 
             reference_valid=torch.ones(count, references, dtype=torch.bool),
         )
     )
+
+
+def random_model(config: ModelConfig) -> ExtrapolationModel:
+    """The same for every call, with an output of its own beside the warp."""
+    torch.manual_seed(0)
+    model = ExtrapolationModel(config).eval()
+    nn.init.normal_(model.unet.conv_out.weight, std=0.05)
+    return model
