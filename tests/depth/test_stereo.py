@@ -12,10 +12,10 @@ from extrap_train.errors import InputError
 from extrap_train.geometry.cameras import unproject_to_world
 from extrap_train.views import Camera, View
 
-STEREO = PlaneSweepStereo(StereoConfig(image_size=160))
+STEREO = PlaneSweepStereo(StereoConfig(image_size=128))
 
 
-def three_views(scene: str, size: int = 160) -> list[View]:
+def three_views(scene: str, size: int = 128) -> list[View]:
     """15° apart, each exposed differently, with sensor noise."""
     return [
         render(SCENES[scene], orbit_camera(azimuth_deg, size), gain, noise=0.01)

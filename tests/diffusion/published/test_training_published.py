@@ -24,7 +24,7 @@ from extrap_train.diffusion.model_files import initial_model, load_model, save_m
 from extrap_train.diffusion.sampler import sample_views
 from extrap_train.diffusion.training import CategoryTraining
 
-_STEPS = 3
+_STEPS = 2
 
 
 def _trains(config: ModelConfig, folder: Path, *, mixed: bool) -> None:
