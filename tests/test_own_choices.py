@@ -10,6 +10,7 @@ import torch
 from benchmarks.catalogue import Catalogue
 from benchmarks.protocol.prepared_scene import Truth
 from benchmarks.run.identity import scores_manifest, sources_digest
+from benchmarks.score import scoring
 from benchmarks.score.scoring import score_images
 from extrap_train.config import (
     DepthConfig,
@@ -88,6 +89,8 @@ _FLAT = "defaults: [own_schema, _self_]\nname: flat\nfactory: own_flat.Flat\n"
 def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.setenv("PYTHONPATH", "")
+    # Its SSIM imports for seconds at its first call, and nothing here is about it.
+    monkeypatch.setattr(scoring, "megascenes_compat", lambda *_: {})
     for group in ("depth", "matcher", "metric"):
         (tmp_path / group).mkdir()
     (tmp_path / "own_flat.py").write_text(_DEPTH)
@@ -170,17 +173,17 @@ def test_a_table_takes_a_metric_from_a_folder(own: Path) -> None:
     words = ["scoring.metrics=[bright]", "columns=[psnr,bright]", "scoring.lpips=[]"]
     table = catalogue.table("table1", [*words, "scoring.dists=false"])
     catalogue.check(table)
-    scoring = table.scoring
-    assert metric_direction("bright", scoring.own) == -1
-    assert metric_direction("psnr", scoring.own) == 1
-    scores = score_images(torch.full((1, 3, 16, 16), 0.5), _truth(), scoring)
+    options = table.scoring
+    assert metric_direction("bright", options.own) == -1
+    assert metric_direction("psnr", options.own) == 1
+    scores = score_images(torch.full((1, 3, 16, 16), 0.5), _truth(), options)
     assert scores["bright"].value == pytest.approx(0.25)
     assert {"psnr", "ssim"} <= scores.keys()
-    before = scores_manifest(scoring)
+    before = scores_manifest(options)
     sources_digest.cache_clear()
     (own / "own_bright.py").write_text(_METRIC + "\n")
-    assert scores_manifest(scoring).inputs != before.inputs
-    assert scores_manifest(scoring).options == before.options
+    assert scores_manifest(options).inputs != before.inputs
+    assert scores_manifest(options).options == before.options
 
 
 @pytest.mark.parametrize(
