@@ -157,7 +157,7 @@ def test_corrections_and_the_worst_pairs_are_shown(tmp_path: Path) -> None:
     data = prepare(
         [textured_capture(str(i)) for i in range(2)],
         DatasetDepth(),
-        PrepConfig(image_size=64, max_uses=4),
+        PrepConfig(image_size=64, max_uses=2),
         test_names=1,
         folder=tmp_path / "cup",
         matcher=FlowMatcher(FlowMatcherConfig()),
