@@ -33,7 +33,7 @@ class IncrementalDiffusion(Diffusion):
 
     def sample(self, model: ExtrapolationModel, inputs: SceneInputs) -> Synthesis:
         """Sample and merge every target; returns the points of the whole map as well."""
-        options = CompletionConfig()
+        options = CompletionConfig(references="all")
         world = fit_world_frame(stack_cameras([view.camera for view in inputs.fine_views]))
         size = model.config.warp_size
         views, confidences = first_views(inputs.fine_views, inputs.depth_source, world, size)

@@ -129,6 +129,12 @@ class CompletionConfig:
     step_deg: float = option(
         30.0, "angle between neighbouring views of the orbit", unit="degrees", low=1, high=180
     )
+    references: str = option(
+        "photographs",
+        "what new views are generated from: the photographs alone, or from generated views, too, "
+        "as in the paper",
+        known=("photographs", "all"),
+    )
     edges: int = option(4, "known views that a new one is aligned to", low=1, high=64)
     tolerance: float = option(
         0.01,

@@ -89,7 +89,8 @@ def add_view(
     While it contradicts the map it is generated again with another seed; the best attempt enters.
     """
     options, clock = pipeline.options, _Clock()
-    references = known.nearest(query.camera, REFERENCES)
+    only_photographs = options.references == "photographs"
+    references = known.nearest(query.camera, REFERENCES, photographs=only_photographs)
     neighbours = known.nearest(query.camera, options.edges)
     tries = options.confidence.attempts if options.confidence.regenerate else 1
     best: tuple[Proposal, int] | None = None

@@ -71,12 +71,15 @@ class GlobalMap:
         """All cameras, batched."""
         return stack_cameras([view.camera for view in self.views])
 
-    def nearest(self, camera: Camera, count: int) -> list[int]:
-        """Indices of the views nearest to an (unbatched) camera, nearest first."""
+    def nearest(self, camera: Camera, count: int, *, photographs: bool = False) -> list[int]:
+        """Indices of the views nearest to an (unbatched) camera, nearest first: of all views, or of
+        the `photographs` alone.
+        """
         if not self.views:
             return []
-        order = references_by_nearness(self.cameras, stack_cameras([camera]))[0]
-        return [int(index) for index in order[:count]]
+        order = references_by_nearness(self.cameras, stack_cameras([camera]))[0].tolist()
+        chosen = [i for i in order if not photographs or self.views[i].origin.kind == GIVEN]
+        return chosen[:count]
 
     def added(
         self, view: View, confidence: Float[Tensor, "h w"], origin: Origin

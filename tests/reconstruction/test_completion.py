@@ -107,8 +107,8 @@ def inputs(*azimuths_deg: float) -> GlobalMap:
     return map_of_inputs(views, [(view.depth > 0).float() for view in views], 0.01)
 
 
-def completed(known: GlobalMap, generator=None, **confidence):
-    options = CompletionConfig(confidence=ConfidenceConfig(**confidence))
+def completed(known: GlobalMap, generator=None, references="photographs", **confidence):
+    options = CompletionConfig(references=references, confidence=ConfidenceConfig(**confidence))
     steps = []
     pipeline = CompletionPipeline(generator or TracedGenerator(), TracedDepth(), options, 0)
     # Queries are planned from the inputs alone, wherever a run was cut.
@@ -151,6 +151,17 @@ def test_a_turn_fills_what_the_inputs_leave_open(whole):
     assert off_surface(known) < 0.02
     assert len(steps) == 9
     assert all(step.edges >= 3 and step.attempts == 1 for step in steps)
+
+
+def test_views_are_generated_from_the_photographs_alone_or_from_all_views(whole):
+    photographs = inputs(-30.0, 0.0, 30.0)
+    chained, _ = completed(photographs, references="all")
+    for known, is_chained in ((whole[0], False), (chained, True)):
+        used = [i for view in known.views for i in view.origin.references]
+        assert used
+        assert (max(used) >= len(photographs)) == is_chained
+    # Nothing stands nearer to the first new view than the photographs, whatever is allowed.
+    assert chained.views[3].origin.references == whole[0].views[3].origin.references
 
 
 def test_two_branches_meet_and_hardly_disagree(whole):

@@ -1,4 +1,5 @@
-"""What the depth of generated views is worth to the completed scene, and how good that depth is.
+"""What the depth of generated views and what they are generated from are worth to the completed
+scene, and how good depth and pictures are.
 
 `python -m pytest -s -m slow tests/reconstruction/test_depth_table.py` prints the tables of
 docs/completion.md: six categories, captures of another seed than any that a model was trained or a
@@ -10,13 +11,14 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
 from extrap_train.config import CompletionConfig, StereoConfig, SyntheticConfig
 from extrap_train.data.scene_spec import open_scene
 from extrap_train.data.sequences import Frame
-from extrap_train.data.synthetic import SyntheticScene, build_scene, trace
+from extrap_train.data.synthetic import SyntheticScene, build_scene, render, trace
 from extrap_train.depth.stereo import PlaneSweepStereo
 from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.geometry.viewpoints import directions_from, scene_center
@@ -28,7 +30,7 @@ from extrap_train.reconstruction.depth_completion.inference import (
     DepthCompletion,
 )
 from extrap_train.reconstruction.exact import ExactDepth
-from extrap_train.reconstruction.global_map import GENERATED, GlobalMap
+from extrap_train.reconstruction.global_map import GENERATED, GlobalMap, MapView
 from extrap_train.reconstruction.inputs import choose_frames, first_views, fit_world_frame
 from extrap_train.reconstruction.planner import orbit_queries
 from extrap_train.reconstruction.prior import prior_of
@@ -72,10 +74,16 @@ class Capture:
         depth, mask = trace(self.scene, self.world.outside(view.camera))
         return depth / self.world.unit, mask > 0.5
 
-    def completed(self, completion: DepthCompletion | None) -> GlobalMap:
-        pipeline = CompletionPipeline(
-            self.generator, PlaneSweepStereo(StereoConfig()), CompletionConfig(), 0, completion
-        )
+    def picture(self, view: View) -> torch.Tensor:
+        """What a camera there would have taken."""
+        return render(self.scene, self.world.outside(view.camera)).image
+
+    def completed(
+        self, completion: DepthCompletion | None, references: str = "photographs"
+    ) -> GlobalMap:
+        options = CompletionConfig(references=references)
+        stereo = PlaneSweepStereo(StereoConfig())
+        pipeline = CompletionPipeline(self.generator, stereo, options, 0, completion)
         queries = orbit_queries(self.inputs.cameras, np.radians(30))
         return complete(self.inputs, queries, pipeline, lambda *_: None)
 
@@ -97,9 +105,24 @@ class ExactCompletion:
         return CompletedDepth(depth, (depth > 0).float(), (prior.depth / depth - 1).abs() < WITHIN)
 
 
-def generated_errors(capture: Capture, known: GlobalMap) -> list[tuple[float, np.ndarray]]:
-    """Angle to the nearest input; relative error and confidence of the object's pixels that no
-    input shows, of every generated view."""
+@dataclass(frozen=True)
+class GeneratedView:
+    """One generated view against the truth."""
+
+    view: MapView
+    angle_deg: float
+    """To the nearest input."""
+    depth: torch.Tensor
+    hidden: torch.Tensor
+    """The object's pixels that no input shows."""
+
+    def errors(self) -> np.ndarray:
+        """Relative error and confidence of the hidden pixels' depth."""
+        error = torch.where(self.view.depth > 0, (self.view.depth / self.depth - 1).abs(), 1)
+        return torch.stack([error, self.view.confidence])[:, self.hidden].numpy()
+
+
+def generated_views(capture: Capture, known: GlobalMap) -> list[GeneratedView]:
     center = scene_center(known.cameras)
     towards = directions_from(capture.inputs.cameras, center)
     found = []
@@ -110,8 +133,7 @@ def generated_errors(capture: Capture, known: GlobalMap) -> list[tuple[float, np
         angle_deg = float(np.degrees(np.arccos((towards @ direction).max().clip(-1, 1))))
         depth, mask = capture.truth(view.view)
         hidden = mask & ~shown_by(capture.inputs, replace(view.view, depth=depth))
-        error = torch.where(view.depth > 0, (view.depth / depth - 1).abs(), 1)[hidden]
-        found.append((angle_deg, torch.stack([error, view.confidence[hidden]]).numpy()))
+        found.append(GeneratedView(view, angle_deg, depth, hidden))
     return found
 
 
@@ -131,7 +153,7 @@ def test_what_exact_depth_at_birth_is_worth(is_exact: bool) -> None:
             known = capture.completed(ExactCompletion(capture) if is_exact else None)
             found = capture.scores(known)
             rows.append([found[name] for name in ("accuracy", "completeness", "f_score")])
-            errors += generated_errors(capture, known)
+            errors += [(x.angle_deg, x.errors()) for x in generated_views(capture, known)]
             print(f"\n{category} {number}: " + " / ".join(f"{value:.3f}" for value in rows[-1]))
     means = np.mean(rows, 0)
     print("mean: " + " / ".join(f"{value:.3f}" for value in means))
@@ -147,3 +169,28 @@ def test_what_exact_depth_at_birth_is_worth(is_exact: bool) -> None:
             )
     if is_exact:
         assert means[2] > 0.9
+
+
+@pytest.mark.slow
+def test_pictures_generated_from_the_photographs_alone_show_more_of_the_object() -> None:
+    """Each generated view again, from the photographs and from generated views, too: PSNR of the
+    object's pixels that no input shows."""
+    rows = []
+    for category in CATEGORIES:
+        for number in NUMBERS[:2]:
+            capture = Capture.open(category, number)
+            for references in ("photographs", "all"):
+                known = capture.completed(None, references)
+                score = capture.scores(known)["f_score"]
+                print(f"\n{category} {number} from {references}: F-score {score:.3f}", flush=True)
+                for made in generated_views(capture, known):
+                    if not made.hidden.any():
+                        continue
+                    error = (made.view.view.image - capture.picture(made.view.view)) ** 2
+                    db = -10 * np.log10(float(error.mean(0)[made.hidden].mean()))
+                    rows.append((references, made.angle_deg, db, score))
+    frame = pd.DataFrame(rows, columns=["references", "angle_deg", "psnr", "f_score"])
+    frame["to_deg"] = pd.cut(frame["angle_deg"], [0, *ANGLES_DEG], labels=ANGLES_DEG)
+    means = frame.pivot_table("psnr", "to_deg", "references", observed=True)
+    print(means.round(2), frame.groupby("references")["f_score"].mean().round(3), sep="\n")
+    assert means["photographs"][180] > means["all"][180]
