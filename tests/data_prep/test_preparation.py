@@ -1,6 +1,7 @@
 import json
 import os
 import re
+import socket
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -100,11 +101,12 @@ def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
 
 
 def test_what_a_killed_run_has_half_written_is_removed(tmp_path: Path) -> None:
+    killed = f"{socket.gethostname().partition('.')[0]}-999999"
     for kind in ("frames", "pairs"):
-        half = tmp_path / "cup" / kind / "cup" / ".0001.x7.tmp"
+        half = tmp_path / "cup" / kind / "cup" / f".0001.{killed}.tmp"
         half.mkdir(parents=True)
         (half / "images.npy").write_bytes(b"half of it")
-    (tmp_path / "cup" / ".manifest.json.77.tmp").write_bytes(b"{")
+    (tmp_path / "cup" / f".manifest.json.{killed}.tmp").write_bytes(b"{")
     run(tmp_path / "cup", captures(3))
     assert not list((tmp_path / "cup").rglob("*.tmp"))
 
