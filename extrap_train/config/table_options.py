@@ -127,8 +127,7 @@ class ScoringConfig:
     metrics: list[str] = option(
         [], "metrics of your own: names of files below metric/ in --config-dir", is_set=True
     )
-    own: dict[str, MetricConfig] = field(default_factory=dict)
-    """What these files say; the catalogue fills it in."""
+    own: dict[str, MetricConfig] = option({}, "what these files say; not to be set")
 
 
 @dataclass
