@@ -213,8 +213,11 @@ def packaged_names() -> list[str]:
 
 def resolve_path(name: str, value: Any) -> Any:
     """The value of the option called `name` in its group; of a path, the one that it leads to."""
-    if not isinstance(value, str) or not value or value in packaged_names():
+    if not isinstance(value, str) or not value:
         return value
-    if name in _PATHS or (name in _PATHS_OR_NAMES and Path(value).exists()):
+    is_path = name in _PATHS
+    if name in _PATHS_OR_NAMES:
+        is_path = value not in packaged_names() and Path(value).exists()
+    if is_path:
         return str(Path(value).resolve())
     return value

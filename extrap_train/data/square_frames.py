@@ -24,9 +24,9 @@ HELD_OUT_EVERY = 5
 LEAST_KNOWN_SHARE = 0.25
 """Of the finer depths under a pixel, for it to have one."""
 MOST_UNUSABLE_SHARE = 0.1
-"""Of a sequence's frames, beyond which the whole sequence is not trusted; a single frame never is
-a reason while `LEAST_FRAMES` are left."""
+"""Of a sequence's frames, beyond which the whole sequence is not trusted."""
 LEAST_FRAMES = 2
+"""While so many are left, one unusable frame alone is no reason not to trust a sequence."""
 FRAMES_VERSION = 2
 """Raised whenever the same photographs give other frames."""
 LOG = logging.getLogger(__name__)
