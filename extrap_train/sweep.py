@@ -135,7 +135,9 @@ def row_of(number: int, seconds: float, job: JobReturn) -> Row:
 
 
 def _options(overrides: Iterable[str]) -> dict[str, str]:
-    return dict(word.lstrip("+~").partition("=")[::2] for word in overrides)
+    """By name; but for `output`, so that a sweep goes on where its folder was moved to."""
+    options = dict(word.lstrip("+~").partition("=")[::2] for word in overrides)
+    return {name: value for name, value in options.items() if name != "output"}
 
 
 def _give_objective(job: JobReturn, row: Row, objective: str) -> None:

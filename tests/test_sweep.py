@@ -201,6 +201,18 @@ def test_another_sweep_does_not_mix_its_rows_with_those_that_lie_there(
     assert _sweep(monkeypatch, train, folder, "category=apple", "seed=0,1") is None
 
 
+def test_a_sweep_goes_on_where_its_folder_was_moved_to(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    train, words = _trained(tmp_path), ("category=apple", "seed=0,1")
+    assert _sweep(monkeypatch, train, tmp_path / "full", *words, "output=full") is None
+    moved = (tmp_path / "full").rename(tmp_path / "roomy")
+    assert _sweep(monkeypatch, train, moved, *words, "output=roomy") is None
+    table = pd.read_csv(moved / "sweep.csv")
+    assert list(table["seed"]) == [0, 1]
+    assert "output" not in table
+
+
 def test_a_table_that_a_spreadsheet_marked_as_unicode_is_read(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
