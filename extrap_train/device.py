@@ -43,10 +43,14 @@ def resolve_precision(precision: str, device: torch.device) -> str:
     return "bf16-mixed" if has_units else "32-true"
 
 
+def trainer_device(options: TrainerConfig) -> torch.device:
+    """Where `trainer.accelerator` lets networks run."""
+    return torch.device("cpu") if options.accelerator == "cpu" else fastest_device()
+
+
 def trainer_precision(options: TrainerConfig) -> str:
     """`trainer.precision` resolved for `trainer.accelerator`."""
-    device = torch.device("cpu") if options.accelerator == "cpu" else fastest_device()
-    return resolve_precision(options.precision, device)
+    return resolve_precision(options.precision, trainer_device(options))
 
 
 def autocast(device: torch.device, precision: str) -> AbstractContextManager[object]:

@@ -46,6 +46,7 @@ _NOT_PART_OF_THE_RUN = (
     "validation",
     "trainer.steps",
     "trainer.gradient_checkpointing",
+    "trainer.deterministic",
     "trainer.compile",
     "trainer.accelerator",
     "trainer.workers",

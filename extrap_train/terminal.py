@@ -13,6 +13,8 @@ from rich.text import Text
 
 T = TypeVar("T")
 
+DRAWN_EVERY_S = 0.25
+"""On a terminal."""
 LINE_EVERY_S = 10.0
 """A bar writes at most one line in this time where the output is no terminal."""
 LINE_EVERY_SHARE = 0.05
@@ -112,7 +114,11 @@ def progress(
     opens_display = console.is_terminal and not console.is_dumb_terminal and not _LIVE
     _OPEN.append(bar)
     if opens_display:
-        live = Live(console=console, get_renderable=lambda: Group(*_OPEN), refresh_per_second=4)
+        live = Live(
+            console=console,
+            get_renderable=lambda: Group(*_OPEN),
+            refresh_per_second=1 / DRAWN_EVERY_S,
+        )
         live.start()
         _LIVE.append(live)
     try:

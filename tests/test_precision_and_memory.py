@@ -1,4 +1,4 @@
-"""Precision follows the processor; running out of memory says what helps."""
+"""Precision and repeatability follow the processor; running out of memory says what helps."""
 
 from dataclasses import replace
 
@@ -8,6 +8,7 @@ import torch
 from extrap_train.config import TrainerConfig
 from extrap_train.device import advise_on_training_memory, resolve_precision
 from extrap_train.errors import InputError
+from extrap_train.tasks import category
 
 _OPTIONS = TrainerConfig(batch_size=2, precision="32-true")
 
@@ -55,3 +56,19 @@ def test_auto_takes_bfloat16_only_where_a_cpu_has_units_for_it(
     assert resolve_precision("auto", torch.device("mps")) == "32-true"
     for given in ("32-true", "16-mixed", "bf16-mixed"):
         assert resolve_precision(given, torch.device("cpu")) == given
+
+
+@pytest.mark.parametrize(
+    ("device", "asked", "repeats"),
+    [("cpu", False, True), ("cuda", False, False), ("cuda", True, True), ("mps", False, False)],
+)
+def test_a_gpu_repeats_itself_only_if_asked(
+    monkeypatch: pytest.MonkeyPatch, device: str, asked: bool, repeats: bool
+) -> None:
+    monkeypatch.setattr(category, "trainer_device", lambda _: torch.device(device))
+    before = torch.are_deterministic_algorithms_enabled()
+    try:
+        category.quiet_trainer(TrainerConfig(accelerator="cpu", deterministic=asked), logger=False)
+        assert torch.are_deterministic_algorithms_enabled() == repeats
+    finally:
+        torch.use_deterministic_algorithms(before)

@@ -61,6 +61,10 @@ class TrainerConfig:
         "hardware to train on; auto takes a GPU if there is one",
         known=("auto", "cpu", "gpu", "cuda", "mps"),
     )
+    deterministic: bool = option(
+        False,
+        "repeat a GPU's training to the bit, where torch can; slower. A CPU always repeats itself",
+    )
     devices: int = option(1, "GPUs, each with its own batch (distributed data parallel)", low=1)
     checkpoint_every: int = option(
         200, "steps between checkpoints; a killed run loses at most these", low=1

@@ -3,37 +3,67 @@
 import csv
 import io
 import math
+import time
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback, WeightAveraging
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities import rank_zero_only
-from torch import Tensor
+from torch import nn
+from torch.optim.swa_utils import AveragedModel
 
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import write_atomic
-from extrap_train.terminal import progress
+from extrap_train.terminal import DRAWN_EVERY_S, progress
+
+ABOVE_BASELINES = "validation/above_baselines_db"
+"""Of a validation's metrics, what the bar shows."""
 
 
 class AveragedWeights(WeightAveraging):
-    """Exponential moving average with a growing memory: decay min(d, (1 + n)/(10 + n))."""
+    """Exponential moving average with a growing memory: decay min(d, (1 + n)/(10 + n)).
+
+    It lies where the model is trained; an update is one fused operation that waits for nothing.
+    """
 
     def __init__(self, decay: float) -> None:
-        def average(mean: Tensor, value: Tensor, count: Tensor | int) -> Tensor:
-            ramp = (1 + int(count)) / (10 + int(count))
-            return mean.lerp(value, 1 - min(decay, ramp))
+        super().__init__()
+        self.decay = decay
 
-        super().__init__(avg_fn=average)
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Make the average on the training device, to which the model itself moves later."""
+        if stage == "fit":
+            device = trainer.strategy.root_device
+            self._average_model = AveragedModule(pl_module, device, self.decay)
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Hand out the average also where a resumed run had no step left, which skips
         `on_train_end`.
         """
         self._copy_average_to_current(pl_module)
+
+
+class AveragedModule(AveragedModel):
+    """The average of a model's parameters and buffers, all in single precision."""
+
+    def __init__(self, model: nn.Module, device: torch.device, decay: float) -> None:
+        super().__init__(model)
+        self.module.to(device)  # but not the count, which is read in every step
+        self.decay = decay
+
+    @torch.no_grad()
+    def update_parameters(self, model: nn.Module) -> None:
+        """Move the average towards the model; the first time, copy it."""
+        count = int(self.n_averaged)
+        decay = min(self.decay, (1 + count) / (10 + count)) if count else 0.0
+        average, current = ([*each.parameters(), *each.buffers()] for each in (self.module, model))
+        torch._foreach_lerp_(average, current, 1 - decay)
+        self.n_averaged += 1
 
 
 class MetricsTable(Logger):
@@ -98,11 +128,18 @@ def _read(path: Path) -> list[dict[str, str]]:
 
 
 class StepProgress(Callback):
-    """One bar for the whole run: steps, time left, loss, and the last validation."""
+    """One bar for the whole run: steps, time left, loss, and the last validation.
+
+    A GPU is asked for its loss when the bar is drawn and before a checkpoint, not in every step:
+    reading a number waits for everything that the device still has to do.
+    """
 
     def __init__(self, steps: int) -> None:
         self.steps = steps
         self._open = ExitStack()
+        self._loss = torch.zeros(())
+        self._read_at = time.monotonic()
+        self._validation = ""
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Open the bar at the step that the run resumes from."""
@@ -115,15 +152,31 @@ class StepProgress(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Advance, and stop with a clear word if the loss is no number any more."""
-        loss = float(trainer.callback_metrics["loss"])
+        self._loss, note = outputs["loss"], None
+        now = time.monotonic()
+        if self._loss.device.type == "cpu" or now - self._read_at >= DRAWN_EVERY_S:
+            self._read_at = now
+            note = f"loss {self._finite_loss(trainer):.4f}{self._validation}"
+        self._bar.reach(trainer.global_step, note)
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Keep what the bar says of it."""
+        self._validation = f", {float(trainer.callback_metrics[ABOVE_BASELINES]):+.2f} dB"
+
+    def on_save_checkpoint(
+        self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Save no weights after a loss that is no number: weights that it has reached stay none."""
+        self._finite_loss(trainer)
+
+    def _finite_loss(self, trainer: Trainer) -> float:
+        loss = float(self._loss)
         if not math.isfinite(loss):
             raise InputError(
                 f"the loss is not a number at step {trainer.global_step}: lower "
                 "model.learning_rate or set trainer.precision=32-true under another run=NAME"
             )
-        above = trainer.callback_metrics.get("validation/above_baselines_db")
-        note = f"loss {loss:.4f}" + (f", {float(above):+.2f} dB" if above is not None else "")
-        self._bar.reach(trainer.global_step, note)
+        return loss
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Close the bar, also after an error."""

@@ -24,6 +24,8 @@ from extrap_train.exits import Terminated
 from extrap_train.store.atomic import atomic_file
 
 _KEPT = 2
+_AGREED_EVERY = 10
+"""Steps between two questions of several processes whether to stop: each waits for all GPUs."""
 _ENTRIES: dict[str, type] = {
     "global_step": int,
     "state_dict": dict,
@@ -221,8 +223,10 @@ class Checkpoints(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Save and stop if a signal came; at the end of an epoch, after its validation."""
-        is_between = trainer.global_step % self.every and trainer.global_step < trainer.max_steps
-        if is_between and self._is_to_stop(trainer):
+        step = trainer.global_step
+        is_between = step % self.every and step < trainer.max_steps
+        is_agreed = trainer.world_size == 1 or step % _AGREED_EVERY == 0
+        if is_between and is_agreed and self._is_to_stop(trainer):
             self._save(trainer)
             raise _Stop
 

@@ -130,7 +130,7 @@ class KlAutoencoder(Frozen):
         posterior = self._posterior(image)
         latent = posterior.mean.float()
         if generator is not None:
-            noise = torch.randn(latent.shape, generator=generator).to(latent)
+            noise = torch.randn(latent.shape, generator=generator).to(latent, non_blocking=True)
             latent = latent + posterior.std.float() * noise
         return latent * LATENT_SCALE
 

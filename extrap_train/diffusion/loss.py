@@ -39,15 +39,17 @@ def diffusion_loss(
 
     The condition is dropped for a share of the examples, for classifier-free guidance. Every random
     number comes from the (CPU) generator, so that a step is a function of its seed
-    alone. `min_snr` weighs the levels, see `snr_weights`.
+    alone; on its way to a GPU none waits for it. `min_snr` weighs the levels, see `snr_weights`.
     """
     conditioning = model.condition(batch)
     target = model.encode_target(batch.image, conditioning, generator)
     dropped = torch.rand(len(target), generator=generator) < condition_dropout
     steps = model.schedule.config["num_train_timesteps"]
-    timestep = torch.randint(0, steps, (len(target),), generator=generator).to(target.device)
-    noise = torch.randn(target.shape, generator=generator).to(target)
-    conditioning = conditioning.zeroed(dropped.to(target.device))
+    timestep = torch.randint(0, steps, (len(target),), generator=generator).to(
+        target.device, non_blocking=True
+    )
+    noise = torch.randn(target.shape, generator=generator).to(target, non_blocking=True)
+    conditioning = conditioning.zeroed(dropped.to(target.device, non_blocking=True))
     errors = prediction_errors(model, target, noise, timestep, conditioning, anchor)
     if min_snr is not None:
         errors = errors * snr_weights(model.schedule, timestep, min_snr)
@@ -67,7 +69,7 @@ def prediction_errors(
     With an anchor, against the truth where it is known and the unchanged model's prediction
     elsewhere, mixed by area where a latent is both.
     """
-    alpha = model.schedule.alphas_cumprod.to(target)[timestep, None, None, None]
+    alpha = model.schedule.alphas_cumprod.to(target, non_blocking=True)[timestep, None, None, None]
     signal, spread = alpha**0.5, (1 - alpha) ** 0.5
     noisy = signal * target + spread * noise  # equation 4 of Ho et al. 2020
     prediction = model(noisy, timestep, conditioning)
@@ -94,7 +96,7 @@ def snr_weights(
     min(SNR + 1, γ), which is v's even weight (Lin et al. 2023) under the same bound, and what
     Salimans and Ho 2022 give few-step models for this reason.
     """
-    alpha = schedule.alphas_cumprod.to(timestep.device)[timestep]
+    alpha = schedule.alphas_cumprod.to(timestep.device, non_blocking=True)[timestep]
     snr = alpha / (1 - alpha)
     weight = snr + 1 if schedule.config["rescale_betas_zero_snr"] else snr
     per_unit = {"epsilon": snr, "sample": torch.ones_like(snr), "v_prediction": snr + 1}

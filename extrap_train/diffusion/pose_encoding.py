@@ -26,11 +26,9 @@ def depth_scale(depth: Float[Tensor, "b h w"], every: int, least: float) -> Floa
     """Scene scale of a reference: the 0.2 quantile of its known depth on every `every`-th pixel, at
     `least` so much; 1 if none is known.
     """
-    scales = []
-    for sparse in depth[:, ::every, ::every]:
-        known = sparse[sparse > 0]
-        scales.append(known.quantile(_NEAREST_QUANTILE) if known.numel() else sparse.new_ones(()))
-    return torch.stack(scales).clamp_min(least)
+    sparse = depth[:, ::every, ::every].flatten(1)
+    known = torch.where(sparse > 0, sparse, torch.nan)
+    return known.nanquantile(_NEAREST_QUANTILE, 1).nan_to_num(1.0).clamp_min(least)
 
 
 def zeronvs_pose(

@@ -13,6 +13,7 @@ from torch import Tensor
 from extrap_train.config import TrainConfig, TrainerConfig, sampler_for
 from extrap_train.data.module import shard
 from extrap_train.data.pair_examples import linspace_indices
+from extrap_train.diffusion.callbacks import ABOVE_BASELINES
 from extrap_train.diffusion.evaluation import (
     Prediction,
     better_than_baselines,
@@ -57,16 +58,15 @@ class CategoryTraining(lightning.LightningModule):
         """One step; its noise is a function of seed, step and rank."""
         generator = step_generator(self.config.seed, self.global_step, self.global_rank)
         options = self.config.trainer
-        loss = diffusion_loss(
+        return diffusion_loss(
             self.model, batch, generator, options.condition_dropout, options.min_snr
         )
-        self.log("loss", loss, logger=False, sync_dist=True)
-        return loss
 
-    def on_train_batch_end(self, outputs: object, batch: PairBatch, batch_idx: int) -> None:
-        """Record the loss now and then."""
+    def on_train_batch_end(self, outputs: Any, batch: PairBatch, batch_idx: int) -> None:
+        """Record the loss now and then, the mean of all processes."""
         if self.global_step % _STEPS_A_ROW == 0:
-            self._record({"loss": float(self.trainer.callback_metrics["loss"])})
+            mean = self.trainer.strategy.reduce(outputs["loss"], reduce_op="mean")
+            self._record({"loss": float(mean)})
 
     def validation_step(self, batch: PairBatch, batch_idx: int) -> None:
         """Sample the batch's queries."""
@@ -99,7 +99,7 @@ class CategoryTraining(lightning.LightningModule):
         )
         summary = summarise(self.scores())
         metrics = {f"validation/{name}": value for name, value in summary["model"].items()}
-        metrics["validation/above_baselines_db"] = better_than_baselines(summary)
+        metrics[ABOVE_BASELINES] = better_than_baselines(summary)
         self.log_dict(metrics, logger=False)
         self._record(metrics)
 

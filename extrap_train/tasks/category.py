@@ -19,6 +19,7 @@ from extrap_train.data.module import PairModule
 from extrap_train.device import (
     advise_on_training_memory,
     require_accelerator,
+    trainer_device,
     trainer_precision,
 )
 from extrap_train.diffusion.callbacks import AveragedWeights, MetricsTable, StepProgress
@@ -198,14 +199,20 @@ class _Pictures(lightning.Callback):
 
 
 def quiet_trainer(options: TrainerConfig, **more: Any) -> lightning.Trainer:
-    """Lightning's trainer on the options' hardware, without its own checkpoints and bars."""
+    """Lightning's trainer on the options' hardware, without its own checkpoints and bars.
+
+    A CPU repeats itself to the bit; a GPU has slower algorithms for that, and only if asked.
+    """
+    repeats = options.deterministic or trainer_device(options).type == "cpu"
+    # Filling what is empty repeats nothing and takes time.
+    cast(Any, torch.utils.deterministic).fill_uninitialized_memory = False
     return lightning.Trainer(
         accelerator=options.accelerator,
         precision=cast(Any, trainer_precision(options)),
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
-        deterministic="warn",
+        deterministic="warn" if repeats else False,
         **more,
     )
 

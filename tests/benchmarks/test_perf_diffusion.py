@@ -10,6 +10,7 @@ from diffusers.models.attention_processor import Attention
 from torch import nn
 
 from benchmarks.perf import diffusion_case
+from benchmarks.perf.average_timing import compare_averages
 from benchmarks.perf.diffusion_case import (
     batch_of,
     configuration,
@@ -70,6 +71,10 @@ def test_both_samplers_generate_one_picture(model: ExtrapolationModel, batch: Pa
     theirs = plain_sampling(plain(model), batch)()
     ours = sampling(model, batch)()
     assert float((ours - theirs).abs().mean()) < 0.02
+
+
+def test_both_averages_are_one() -> None:
+    assert compare_averages(32, _CPU, repeats=1).max_abs_diff < 1e-6
 
 
 def test_operations_are_those_of_the_layers(config: ModelConfig) -> None:

@@ -1,11 +1,28 @@
-"""What a run shows on its way: a table that forgets what a killed run did behind its checkpoint."""
+"""What a run keeps and shows on its way: the averaged weights, a table that forgets what a killed
+run did behind its checkpoint, and a bar that keeps no GPU waiting.
+"""
 
+import math
+from collections.abc import Iterator
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from batches import batch_of
+from lightning import LightningModule, Trainer
+from lightning.pytorch.accelerators import CPUAccelerator
+from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.strategies import SingleDeviceStrategy
+from torch import Tensor, nn
 
-from extrap_train.diffusion.callbacks import AveragedWeights, MetricsTable
+from extrap_train.config import ModelConfig, TrainConfig
+from extrap_train.diffusion import callbacks
+from extrap_train.diffusion.callbacks import AveragedWeights, MetricsTable, StepProgress
+from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.errors import InputError
 
 
@@ -47,8 +64,109 @@ def test_a_damaged_table_is_one_line(tmp_path: Path, content: str) -> None:
         MetricsTable(tmp_path / "metrics.csv", 40)
 
 
+class _Line(LightningModule):
+    """A weight and a buffer that go up by one a step."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(3))
+        self.register_buffer("seen", torch.zeros(2))
+
+    def training_step(self, batch: Tensor) -> Tensor:
+        self.seen += 1
+        return -self.weight.sum()
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.SGD(self.parameters(), lr=1.0)
+
+
+class _AnyDevice(CPUAccelerator):
+    def setup_device(self, device: torch.device) -> None:
+        """Nothing: Lightning's own refuses every device but the CPU."""
+
+
+class _Stream:
+    """Batches of a length that Lightning does not ask for, as it would on the device."""
+
+    def __init__(self, batches: list[Any]) -> None:
+        self.batches = batches
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter(self.batches)
+
+
+class _OneDevice(SingleDeviceStrategy):
+    def teardown(self) -> None:
+        """Nothing: Lightning's own brings the model back to the CPU."""
+
+
+def _fit(module: LightningModule, *callbacks: Callback, data, steps: int, device: str) -> None:
+    """Train on a device that Lightning moves the model to after its callbacks are set up.
+
+    Tensors on `meta` have no numbers: whatever waits for one, as it would for a GPU, fails.
+    """
+    Trainer(
+        strategy=_OneDevice(torch.device(device), _AnyDevice()),
+        max_steps=steps,
+        callbacks=list(callbacks),
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    ).fit(module, _Stream(data))
+
+
 def test_the_average_follows_fast_at_first_and_slowly_later() -> None:
-    average = AveragedWeights(0.9)._kwargs["avg_fn"]
-    old, new = torch.zeros(1), torch.ones(1)
-    assert float(average(old, new, 0)) == pytest.approx(0.9)
-    assert float(average(old, new, 10_000)) == pytest.approx(0.1)
+    module, average = _Line(), AveragedWeights(0.9)
+    _fit(module, average, data=[torch.zeros(1)] * 30, steps=30, device="cpu")
+    expected = 1.0
+    for count in range(1, 30):
+        decay = min(0.9, (1 + count) / (10 + count))
+        expected = decay * expected + (1 - decay) * (count + 1)
+    for value in (*module.weight.tolist(), *module.seen.tolist()):
+        assert value == pytest.approx(expected, rel=1e-6)
+
+
+def test_the_average_is_kept_where_the_model_is_trained() -> None:
+    average = AveragedWeights(0.9)
+    _fit(_Line(), average, data=[torch.zeros(1)] * 3, steps=3, device="meta")
+    made = average._average_model
+    assert {x.device.type for x in (*made.module.parameters(), *made.module.buffers())} == {"meta"}
+    assert int(made.n_averaged) == 3
+
+
+class _Training(CategoryTraining):
+    """With an optimiser that any device has."""
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), lr=0.1)
+
+
+@pytest.mark.parametrize("family", ["ours", "zeronvs", "megascenes"])
+def test_a_step_waits_for_no_number(
+    monkeypatch: pytest.MonkeyPatch, config: ModelConfig, family: str
+) -> None:
+    """Neither the loss, nor the average, nor the bar between two of its pictures."""
+    monkeypatch.setattr(callbacks, "DRAWN_EVERY_S", math.inf)
+    monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # knows no `meta`
+    model = ExtrapolationModel(replace(config, family=family))
+    batch = batch_of(2, references=1)
+    training = _Training(model, TrainConfig(model=model.config), [], None)
+    _fit(training, AveragedWeights(0.9), StepProgress(3), data=[batch] * 3, steps=3, device="meta")
+
+
+def test_the_bar_reads_a_loss_when_it_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(callbacks, "DRAWN_EVERY_S", 0.0)
+    with pytest.raises(RuntimeError, match="meta"):
+        _fit(_Line(), StepProgress(3), data=[torch.zeros(1)] * 3, steps=3, device="meta")
+
+
+def test_no_checkpoint_is_saved_after_a_loss_that_is_no_number(tmp_path: Path) -> None:
+    """Also where the bar has not read it yet."""
+    bar = StepProgress(9)
+    bar._loss = torch.tensor(math.nan)
+    trainer = Trainer(callbacks=[bar], logger=False, enable_checkpointing=False)
+    trainer.strategy.connect(_Line())
+    with pytest.raises(InputError, match="loss is not a number"):
+        trainer.save_checkpoint(tmp_path / "step.ckpt")
+    assert not list(tmp_path.iterdir())

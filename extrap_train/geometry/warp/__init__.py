@@ -147,4 +147,4 @@ def _project(
 def needs_torch(*inputs: Tensor) -> bool:
     """Whether the numba kernels cannot: another device or precision, or gradients are wanted."""
     differentiated = torch.is_grad_enabled() and any(x.requires_grad for x in inputs)
-    return differentiated or any(x.is_cuda or x.dtype != torch.float32 for x in inputs)
+    return differentiated or any(x.device.type != "cpu" or x.dtype != torch.float32 for x in inputs)
