@@ -1,17 +1,11 @@
-"""Wrong options and unusable input end with one line that says what to do, and with nothing half-
-written.
-"""
+"""Wrong options end with one line that says what to do, and with no run begun."""
 
-import errno
-import gzip
-import json
-import os
 import re
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from in_process import refused_command
 
 from data_prep.__main__ import main as prepare
 from extrap_train.__main__ import main
@@ -25,18 +19,6 @@ def own_choices(tmp_path: Path) -> Path:
     content = "defaults: [category_schema, _self_]\nname: mine\nmembers: [mine]\n"
     (folder / "category" / "mine.yaml").write_text(content)
     return folder
-
-
-def _error(arguments: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> str:
-    """What the command line says before it gives up; it must be one line and leave no run."""
-    monkeypatch.setattr(sys, "argv", ["extrap_train", *arguments, f"output={tmp_path / 'out'}"])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    message = str(stopped.value)
-    assert message.startswith("error: ")
-    assert "\n" not in message
-    assert not (tmp_path / "out" / "train").exists()
-    return message
 
 
 @pytest.mark.parametrize(
@@ -103,10 +85,8 @@ def _error(arguments: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
         ),
     ],
 )
-def test_a_wrong_option_is_one_clear_line(
-    arguments: list[str], said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    assert said in _error(arguments, monkeypatch, tmp_path)
+def test_a_wrong_option_is_one_clear_line(arguments: list[str], said: str, tmp_path: Path) -> None:
+    assert said in refused_command(arguments, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -123,9 +103,9 @@ def test_a_wrong_option_is_one_clear_line(
     ],
 )
 def test_a_value_of_another_type_is_said_as_it_was_given(
-    word: str, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    word: str, said: str, tmp_path: Path
 ) -> None:
-    assert _error(["category=hydrant", word], monkeypatch, tmp_path) == f"error: {word}: {said}"
+    assert refused_command(["category=hydrant", word], tmp_path) == f"error: {word}: {said}"
 
 
 @pytest.mark.parametrize(
@@ -145,123 +125,6 @@ def test_a_command_suggests_only_what_it_has(
         prepare()
 
 
-def test_a_missing_root_is_named_and_hydra_adds_no_line(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    options = ["category=hydrant", "data=co3d", f"data.root={tmp_path / 'nowhere'}"]
-    assert "nowhere" in _error([*options, "model.start=null"], monkeypatch, tmp_path)
-    assert "Error executing job" not in capfd.readouterr().err
-
-
-def test_a_run_is_not_begun_on_data_that_are_none(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """Else its name would be taken."""
-    (tmp_path / "co3d").mkdir()
-    options = ["category=hydrant", "data=co3d", f"data.root={tmp_path / 'co3d'}", "run=mine"]
-    assert "has no category" in _error([*options, "model.start=null"], monkeypatch, tmp_path)
-
-
-@pytest.mark.parametrize("command", [main, prepare])
-def test_no_member_is_prepared_where_another_is_missing(
-    command: Callable[[], None], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """The one that is there is not even read: its annotations would be refused."""
-    (tmp_path / "co3d/apple").mkdir(parents=True)
-    (tmp_path / "co3d/apple/frame_annotations.jgz").touch()
-    options = ["category=all", "data=co3d", f"data.root={tmp_path / 'co3d'}"]
-    start = ["model.start=null"] if command is main else []
-    monkeypatch.setattr(sys, "argv", ["it", *options, *start, f"output={tmp_path / 'out'}"])
-    with pytest.raises(SystemExit, match="has no category 'book'; categories present: apple"):
-        command()
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_run_is_not_removed_before_there_is_another(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    (tmp_path / "co3d").mkdir()
-    run = tmp_path / "out/train/hydrant/small/mine"
-    for name in ("summary.json", "checkpoints/step-00000003.ckpt", "model/unet"):
-        (run / name).parent.mkdir(parents=True, exist_ok=True)
-        (run / name).touch()
-    before = sorted(run.rglob("*"))
-    options = ["data=co3d", f"data.root={tmp_path / 'co3d'}", "run=mine", "model.start=null"]
-    words = ["extrap_train", "category=hydrant", "resume=false", *options]
-    monkeypatch.setattr(sys, "argv", [*words, f"output={tmp_path / 'out'}"])
-    with pytest.raises(SystemExit, match="has no category"):
-        main()
-    assert sorted(run.rglob("*")) == before
-
-
-def test_a_full_disk_anywhere_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr("extrap_train.__main__.task", lambda name: full)
-    assert "out: No space left on device" in _error(["category=hydrant"], monkeypatch, tmp_path)
-
-
-def test_a_name_that_is_too_long_is_one_line(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    def run(*_: object) -> None:
-        (tmp_path / "out" / ("x" * 300)).mkdir(parents=True)
-
-    monkeypatch.setattr("extrap_train.__main__.task", lambda name: run)
-    assert "shorter run=NAME" in _error(["category=hydrant"], monkeypatch, tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("place", "remedy"),
-    [
-        ("out", "choose another output="),
-        ("out/a/b", "choose"),
-        ("data/cup", "change its rights"),
-    ],
-)
-def test_a_closed_place_is_called_what_it_is(
-    place: str, remedy: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    def closed(*_: object) -> None:
-        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(tmp_path / place))
-
-    monkeypatch.setattr("extrap_train.__main__.task", lambda name: closed)
-    message = _error(["category=hydrant"], monkeypatch, tmp_path)
-    assert f"{place}: Permission denied; " in message
-    assert remedy in message
-
-
-def test_a_folder_above_the_output_that_cannot_be_made_is_of_the_output(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    def closed(*_: object) -> None:
-        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(tmp_path / "out"))
-
-    monkeypatch.setattr("extrap_train.__main__.task", lambda name: closed)
-    options = ["extrap_train", "category=hydrant", f"output={tmp_path / 'out' / 'deep' / 'down'}"]
-    monkeypatch.setattr(sys, "argv", options)
-    with pytest.raises(SystemExit, match=r"out: Permission denied; .* choose another output="):
-        main()
-
-
-def test_a_root_that_may_not_be_looked_at_is_one_line(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """Even where that is found while the options are still checked."""
-
-    def closed(*_: object) -> None:
-        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), "/closed/co3d")
-
-    monkeypatch.setattr("extrap_train.cli.validate", closed)
-    options = ["category=hydrant", "data=co3d", "data.root=/closed/co3d"]
-    message = _error(options, monkeypatch, tmp_path)
-    assert (
-        message
-        == "error: /closed/co3d: Permission denied; change its rights, or name another place"
-    )
-
-
 @pytest.mark.parametrize("form", ["--config-dir {}", "--config-dir={}", "-cd {}"])
 def test_a_category_is_added_with_one_file_in_a_folder_of_ones_own(
     form: str, own_choices: Path, monkeypatch: pytest.MonkeyPatch
@@ -279,59 +142,16 @@ def test_a_category_is_added_with_one_file_in_a_folder_of_ones_own(
 
 
 def test_a_choice_that_is_in_no_folder_lists_those_of_ones_own(
-    own_choices: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    own_choices: Path, tmp_path: Path
 ) -> None:
-    message = _error([f"--config-dir={own_choices}", "category=mien"], monkeypatch, tmp_path)
+    message = refused_command([f"--config-dir={own_choices}", "category=mien"], tmp_path)
     assert "did you mean mine?; known: all, apple, book, chair, cup, hydrant, mine" in message
-    message = _error(["--config-dir", "/nowhere", "category=mine"], monkeypatch, tmp_path)
+    message = refused_command(["--config-dir", "/nowhere", "category=mine"], tmp_path)
     assert "--config-dir /nowhere: no such folder" in message
 
 
-@pytest.mark.parametrize("place", ["file", "/proc/nowhere"])
-def test_an_output_that_can_be_no_folder_is_one_line(
-    place: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    (tmp_path / "file").write_text("not a folder")
-    output = tmp_path / place
-    options = ["category=hydrant", "data.train_sequences=1", f"output={output}"]
-    monkeypatch.setattr(sys, "argv", ["command", *options])
-    with pytest.raises(SystemExit) as stopped:
-        prepare()
-    message = str(stopped.value)
-    assert re.fullmatch(rf"error: {output}.*choose another (output=|folder)", message), message
-
-
-def test_annotations_that_climb_out_are_refused(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    folder = tmp_path / "co3d" / "hydrant"
-    folder.mkdir(parents=True)
-    viewpoint = {
-        "R": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-        "T": [0, 0, 5],
-        "focal_length": [2, 2],
-        "principal_point": [0, 0],
-        "intrinsics_format": "ndc_isotropic",
-    }
-    frame = {
-        "sequence_name": "a",
-        "frame_number": 0,
-        "image": {"path": "../../secret.jpg", "size": [64, 64]},
-        "viewpoint": viewpoint,
-    }
-    sequence = {"sequence_name": "a", "category": "hydrant"}
-    for name, entries in (("frame", [frame]), ("sequence", [sequence])):
-        content = gzip.compress(json.dumps(entries).encode())
-        (folder / f"{name}_annotations.jgz").write_bytes(content)
-    options = ["category=hydrant", "data=co3d", f"data.root={tmp_path / 'co3d'}"]
-    message = _error([*options, "model.start=null"], monkeypatch, tmp_path)
-    assert "../../secret.jpg" in message
-
-
-def test_a_start_that_is_no_model_lists_those_in_the_package(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    message = _error(["category=hydrant", "model.start=nonsense"], monkeypatch, tmp_path)
+def test_a_start_that_is_no_model_lists_those_in_the_package(tmp_path: Path) -> None:
+    message = refused_command(["category=hydrant", "model.start=nonsense"], tmp_path)
     assert "model.start=nonsense is neither a file or folder of weights" in message
     assert "nor one of the package's: base" in message
 
@@ -386,10 +206,9 @@ def test_a_choice_of_ones_own_that_is_malformed_is_one_line(
     content: str,
     expected: tuple[str, ...],
     own_choices: Path,
-    monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
 ) -> None:
     (own_choices / "category/mine.yaml").write_text(content)
-    message = _error([f"--config-dir={own_choices}", "category=mine"], monkeypatch, tmp_path)
+    message = refused_command([f"--config-dir={own_choices}", "category=mine"], tmp_path)
     assert "\n" not in message
     assert all(text in message for text in expected), message
