@@ -12,6 +12,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numba
 import pytest
 import torch
+from hydra._internal.hydra import Hydra
+from hydra.types import RunMode
 from shape_checks import check_shapes, forget_checks
 
 check_shapes()
@@ -65,6 +67,22 @@ def _fork_server_of_a_worker(request: pytest.FixtureRequest) -> None:
     """A test that starts a server for itself would decide what that of the others imports."""
     if "PYTEST_XDIST_WORKER" in os.environ:
         request.getfixturevalue("fork_server")
+
+
+def _compose_once() -> None:
+    """Hydra composes a command's options a first time to look for a sweep in them: only a word or
+    a flag asks for one here.
+    """
+    get_mode = Hydra.get_mode
+
+    def mode(self: Hydra, config_name: str | None, overrides: list[str]) -> RunMode | None:
+        asked = any(word.startswith("hydra.mode=") for word in overrides)
+        return get_mode(self, config_name, overrides) if asked else None
+
+    Hydra.get_mode = mode
+
+
+_compose_once()
 
 
 def _use_one_thread() -> None:

@@ -4,6 +4,7 @@ import shutil
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from benchmarks.report.aggregate import read_results
 from benchmarks.run.plan import TableFolder
 from benchmarks.run.run_method import build_method
 from benchmarks.run_table import RunOptions, run_table
-from extrap_train.config import ModelConfig, UNetConfig
+from extrap_train.config import ModelConfig, StereoConfig, UNetConfig
 from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.model_files import save_model
@@ -32,7 +33,7 @@ from extrap_train.jobs.local import LocalLauncher
 from extrap_train.views import View
 from tests.benchmarks.analytic import scene_inputs
 
-STEPS = 8
+STEPS = 4
 VARIANTS: dict[str, Diffusion] = {
     "ours": Diffusion(),
     "one reference": Diffusion(references=1),
@@ -61,6 +62,18 @@ def _own_models() -> Iterator[None]:
     _loaded.cache_clear()
     yield
     _loaded.cache_clear()
+
+
+@pytest.fixture
+def cheap(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Held-out pairs at one level of noise and stereo with few planes: what is asked here is the
+    same for any number of them.
+    """
+    monkeypatch.setattr("extrap_train.diffusion.adaptation._LEVELS", 1)
+    monkeypatch.setattr("extrap_train.diffusion.adaptation._DRAWS", 1)
+    monkeypatch.setattr(
+        "benchmarks.methods.incremental.StereoConfig", partial(StereoConfig, planes=16)
+    )
 
 
 @pytest.fixture
@@ -102,6 +115,7 @@ def test_its_weight_files_are_also_those_that_a_link_leads_to(tmp_path: Path) ->
     assert files == [tmp_path / "model" / "unet" / "weights"]
 
 
+@pytest.mark.usefixtures("cheap")
 @each_variant
 def test_it_generates_the_targets_and_repeats_itself(name: str, weights: str) -> None:
     inputs, truth = scene_inputs(size=40)  # other than the model's: it is resampled
@@ -135,6 +149,7 @@ def test_one_reference_is_the_nearest_input(weights: str) -> None:
     assert changed[1] == 0
 
 
+@pytest.mark.usefixtures("cheap")
 def test_an_adapter_is_its_scenes_alone(weights: str) -> None:
     """An earlier scene changes neither the model nor what another scene is adapted to."""
     one, _ = scene_inputs((0.0, 40.0, 80.0))
@@ -196,6 +211,7 @@ def test_what_a_process_does_once_is_not_a_cells_time(
     assert len(calls) == 2
 
 
+@pytest.mark.usefixtures("cheap")
 def test_what_is_generated_is_a_reference_for_the_next(
     weights: str, asked: list[tuple[str, list[View], Tensor]]
 ) -> None:
