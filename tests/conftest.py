@@ -105,6 +105,15 @@ def _shapes_are_checked_in_every_test() -> None:
 
 
 @pytest.fixture
+def measured_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An adaptation's held-out pairs at one level, with one noise: what follows from their error is
+    the same for any number of them.
+    """
+    monkeypatch.setattr("extrap_train.diffusion.adaptation._LEVELS", 1)
+    monkeypatch.setattr("extrap_train.diffusion.adaptation._DRAWS", 1)
+
+
+@pytest.fixture
 def umask() -> Iterator[Callable[[int], int]]:
     """Sets this process's umask until the test ends."""
     before = os.umask(0o022)

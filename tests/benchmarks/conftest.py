@@ -1,12 +1,20 @@
 """A small finished table that tests read, or damage a copy of."""
 
 import shutil
+from collections.abc import Iterator
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
 
 import pytest
+from rendered_once import rendered_once
 
 from tests.benchmarks.tables import run_greys, write_own
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _rendered_once() -> Iterator[None]:
+    with rendered_once():
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -19,7 +27,15 @@ def own(fork_server: ForkServerContext, tmp_path_factory: pytest.TempPathFactory
 def finished(own: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Its table's output folder; it is only read."""
     output = tmp_path_factory.mktemp("results")
-    assert run_greys(own, output) == 0
+    assert run_greys(own, output, draws=True) == 0
+    return output
+
+
+@pytest.fixture(scope="session")
+def quick(own: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The output folder of a quick run of the same table; it is only read."""
+    output = tmp_path_factory.mktemp("quick")
+    assert run_greys(own, output, quick=True) == 0
     return output
 
 

@@ -1,6 +1,10 @@
 """A small table of one's own, as a third party writes it: one file, and a YAML a method."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
+
+import pytest
 
 from benchmarks.catalogue import Catalogue
 from benchmarks.run.plan import TableFolder
@@ -82,14 +86,30 @@ def write_own(folder: Path) -> Path:
     return folder
 
 
+@contextmanager
+def without_plots() -> Iterator[None]:
+    """Drawing takes longer than all other reports of a small table."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("benchmarks.report.plots", lambda results: {})
+        yield
+
+
 def run_greys(
-    own: Path, output: Path, *overrides: str, launcher: Launcher | None = None, **options: object
+    own: Path,
+    output: Path,
+    *overrides: str,
+    launcher: Launcher | None = None,
+    draws: bool = False,
+    **options: object,
 ) -> int:
-    """Run the table, one cell after another unless there is a launcher."""
+    """Run the table, one cell after another unless there is a launcher; it `draws` no plots unless
+    asked to.
+    """
     catalogue = Catalogue.with_own([str(own)])
     table = catalogue.table("greys", [f"output={output}", *overrides])
     run = RunOptions(**{"workers": 1, "launcher": launcher, **options})  # type: ignore[arg-type]
-    return run_table(table, catalogue, run)
+    with nullcontext() if draws else without_plots():
+        return run_table(table, catalogue, run)
 
 
 def greys_folder(output: Path) -> TableFolder:

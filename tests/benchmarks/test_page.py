@@ -18,7 +18,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     if browser is None:
         pytest.skip("needs chromium")
     folder = tmp_path_factory.mktemp("page")
-    run_greys(write_own(folder / "own"), folder / "out", "methods=[dark,light,broken]")
+    run_greys(write_own(folder / "own"), folder / "out", "methods=[dark,light,broken]", draws=True)
     with playwright.sync_playwright() as driver:
         window = driver.chromium.launch(
             executable_path=browser, args=["--no-sandbox", "--disable-gpu"]

@@ -21,6 +21,7 @@ from benchmarks.run.cells import Cell
 from benchmarks.run.plan import TableFolder
 from benchmarks.run_table import RunOptions, run_table
 from tests.benchmarks.rogues import BEFORE, ENDS, HANGS, LEFTOVERS, SOUND, STATE, write_rogues
+from tests.benchmarks.tables import without_plots
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="asks /proc for processes")
 
@@ -83,7 +84,8 @@ def _run(
     methods = ",".join([*names, "honest", "inpainted"])
     overrides = [f"output={output}", f"methods=[{methods}]", *words]
     before = _sleepers()
-    run_table(catalogue.table("rogues", overrides), catalogue, RunOptions(workers=workers))
+    with without_plots():
+        run_table(catalogue.table("rogues", overrides), catalogue, RunOptions(workers=workers))
     assert _sleepers() <= before
     folder = TableFolder(output / "rogues")
     assert verify(folder).problems == []

@@ -51,15 +51,6 @@ def _adapted(
     )
 
 
-@pytest.fixture
-def measured_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The held-out pairs at one level, with one noise: what follows from their error is the same
-    for any number of them.
-    """
-    monkeypatch.setattr("extrap_train.diffusion.adaptation._LEVELS", 1)
-    monkeypatch.setattr("extrap_train.diffusion.adaptation._DRAWS", 1)
-
-
 @pytest.mark.usefixtures("measured_once")
 def test_adapting_learns_the_scene_repeatably_and_keeps_the_best(config: ModelConfig) -> None:
     options = {"steps": 8, "learning_rate": 3e-3, "patience": 100, "virtual_references": 2}

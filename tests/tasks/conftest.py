@@ -1,11 +1,12 @@
 """One scene on the command line: a tiny model, and the commands that work on the scene with it."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import torch
+from rendered_once import rendered_once
 
 from extrap_train.__main__ import main
 from extrap_train.config import ModelConfig, UNetConfig
@@ -18,6 +19,12 @@ _SCENE = ["scene=synthetic:hydrant/0000", "data.frames=8", "data.image_size=32",
 
 Command = Callable[..., None]
 Refused = Callable[..., str]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _rendered_once() -> Iterator[None]:
+    with rendered_once():
+        yield
 
 
 @pytest.fixture(scope="session")

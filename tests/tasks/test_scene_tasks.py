@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 import cv2
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -153,6 +154,7 @@ def test_no_two_pictures_have_one_name(names: list[str]) -> None:
     assert not any("/" in file or len(file.encode()) > 255 for file in files)
 
 
+@pytest.mark.usefixtures("measured_once")
 def test_an_adapter_is_made_used_again_and_put_upon_the_weights(
     command, weights, tmp_path, capsys
 ) -> None:
@@ -182,6 +184,7 @@ def test_an_adapter_is_made_used_again_and_put_upon_the_weights(
     assert "PSNR against the photograph" in said.out
 
 
+@pytest.mark.usefixtures("measured_once")
 def test_a_damaged_adapter_is_made_again_and_one_of_other_weights_is_kept(
     command, refused, weights, tmp_path, capsys
 ) -> None:
@@ -189,6 +192,7 @@ def test_a_damaged_adapter_is_made_again_and_one_of_other_weights_is_kept(
     folder, model = tmp_path / "scene" / "hydrant-0000", tmp_path / "model"
     shutil.copytree(weights, model)
     options = ["minutes=0.2", "lora.steps=1", "lora.validate_every=1", "sampler.steps=1"]
+    options += ["lora.batch_size=1", "lora.virtual_references=2"]
     asked = ["task=scene", f"weights={model}", *options]
 
     def is_made() -> bool:
