@@ -2,6 +2,7 @@
 
 import codecs
 import json
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -54,6 +55,24 @@ def _sweep(
     except SystemExit as stopped:
         return str(stopped)
     return None
+
+
+_WORDS = ("category=apple", "seed=0,1", "trainer.steps=3")
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a sweep of two jobs; it is only read."""
+    folder = tmp_path_factory.mktemp("finished")
+    with pytest.MonkeyPatch.context() as patch:
+        assert _sweep(patch, _trained(folder), folder / "sweep", *_WORDS) is None
+    return folder / "sweep"
+
+
+@pytest.fixture
+def swept(finished: Path, tmp_path: Path) -> Path:
+    """A copy of it to change, or to go on with."""
+    return Path(shutil.copytree(finished, tmp_path / "sweep"))
 
 
 def test_every_job_is_a_row_with_its_overrides_and_metrics(
@@ -188,17 +207,16 @@ def test_two_sweeps_at_once_in_one_folder_are_one_too_many(
 
 
 def test_another_sweep_does_not_mix_its_rows_with_those_that_lie_there(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, swept: Path
 ) -> None:
-    train, folder = _trained(tmp_path), tmp_path / "sweep"
-    assert _sweep(monkeypatch, train, folder, "category=apple", "seed=0,1") is None
-    before = (folder / "sweep.csv").read_bytes()
-    for other in ("seed=0,1,2", "seed=1,0", "trainer.steps=3,4"):
-        said = _sweep(monkeypatch, train, folder, "category=apple", other)
+    train = _trained(tmp_path)
+    before = (swept / "sweep.csv").read_bytes()
+    for other in ("seed=0,1,2", "seed=1,0", "trainer.steps=4,5"):
+        said = _sweep(monkeypatch, train, swept, *_WORDS, other)
         assert "hydra.sweep.dir" in (said or "")
         assert _lines(said) == 1
-        assert (folder / "sweep.csv").read_bytes() == before
-    assert _sweep(monkeypatch, train, folder, "category=apple", "seed=0,1") is None
+        assert (swept / "sweep.csv").read_bytes() == before
+    assert _sweep(monkeypatch, train, swept, *_WORDS) is None
 
 
 def test_a_sweep_goes_on_where_its_folder_was_moved_to(
@@ -214,14 +232,12 @@ def test_a_sweep_goes_on_where_its_folder_was_moved_to(
 
 
 def test_a_table_that_a_spreadsheet_marked_as_unicode_is_read(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, swept: Path
 ) -> None:
-    train, folder = _trained(tmp_path), tmp_path / "sweep"
-    assert _sweep(monkeypatch, train, folder, "category=apple", "seed=0,1") is None
-    before = (folder / "sweep.csv").read_bytes()
-    (folder / "sweep.csv").write_bytes(codecs.BOM_UTF8 + before)
-    assert _sweep(monkeypatch, train, folder, "category=apple", "seed=0,1") is None
-    assert (folder / "sweep.csv").read_bytes().startswith(b"job,status,")
+    before = (swept / "sweep.csv").read_bytes()
+    (swept / "sweep.csv").write_bytes(codecs.BOM_UTF8 + before)
+    assert _sweep(monkeypatch, _trained(tmp_path), swept, *_WORDS) is None
+    assert (swept / "sweep.csv").read_bytes().startswith(b"job,status,")
 
 
 @pytest.mark.parametrize(
@@ -238,17 +254,15 @@ def test_a_table_that_a_spreadsheet_marked_as_unicode_is_read(
     ],
 )
 def test_a_table_that_a_spreadsheet_changed_ends_the_sweep_before_its_jobs(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, edit: Callable[[bytes], bytes]
+    monkeypatch: pytest.MonkeyPatch, swept: Path, edit: Callable[[bytes], bytes]
 ) -> None:
-    words, folder = ("category=apple", "seed=0,1", "trainer.steps=3"), tmp_path / "sweep"
-    assert _sweep(monkeypatch, _trained(tmp_path), folder, *words) is None
-    changed = edit((folder / "sweep.csv").read_bytes())
-    (folder / "sweep.csv").write_bytes(changed)
-    said = _sweep(monkeypatch, lambda _: pytest.fail("a job ran"), folder, *words)
+    changed = edit((swept / "sweep.csv").read_bytes())
+    (swept / "sweep.csv").write_bytes(changed)
+    said = _sweep(monkeypatch, lambda _: pytest.fail("a job ran"), swept, *_WORDS)
     assert "sweep.csv" in (said or "")
     assert "hydra.sweep.dir" in (said or "")
     assert _lines(said) == 1
-    assert (folder / "sweep.csv").read_bytes() == changed
+    assert (swept / "sweep.csv").read_bytes() == changed
 
 
 @pytest.mark.parametrize("content", ["", "[" * 20_000, "{}"])
