@@ -63,11 +63,12 @@ def find_model(folder: Path) -> Path | None:
     return largest
 
 
-def read_model(model: Path, images: Path, name: str) -> FrameSequence:
+def read_model(model: Path, images: Path, name: str, upright: bool = False) -> FrameSequence:
     """The capture of a COLMAP model; `images` is the folder that its picture names start from.
 
     Distortion is undone when a frame is read. Entries without a picture, and those with a camera
-    that cannot be used, are left out.
+    that cannot be used, are left out. The cameras of an `upright` model hold the pictures as their
+    EXIF orientation turns them.
     """
     images_file = _images_file(model) or model / "images.bin"
     cameras_file = model / f"cameras{images_file.suffix}"
@@ -84,7 +85,7 @@ def read_model(model: Path, images: Path, name: str) -> FrameSequence:
         except InputError as error:
             unusable.append(entry.fault or str(error))
         else:
-            listed.append(Listed(path, partial(_photograph, entry, cameras, cameras_file)))
+            listed.append(Listed(path, partial(_photograph, entry, cameras, cameras_file, upright)))
     cloud = PointCloud(model, POINT_CLOUD)
     return sequence_of_photographs(
         ListedFiles(images), name, listed, images_file, COLMAP_POSES, unusable, cloud
@@ -107,7 +108,7 @@ def _count_images(model: Path) -> int:
 
 
 def _photograph(
-    entry: ModelImage, cameras: dict[int, ModelCamera], file: Path, path: str
+    entry: ModelImage, cameras: dict[int, ModelCamera], file: Path, upright: bool, path: str
 ) -> Photograph:
     if entry.fault:
         raise InputError(f"{entry.name}: {entry.fault}")
@@ -125,6 +126,7 @@ def _photograph(
         width=camera.width,
         lens=_lens(camera, file),
         world_to_cam=world_to_cam_from_colmap(quaternion, translation),
+        upright=upright,
     )
 
 

@@ -18,15 +18,15 @@ _EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr")
 
 
 def read_photograph(
-    path: Path, size: tuple[int, int], mask_path: Path | None = None
+    path: Path, size: tuple[int, int], mask_path: Path | None = None, upright: bool = False
 ) -> tuple[Float[Tensor, "3 h w"], Float[Tensor, "h w"] | None]:
     """A photograph of `size` (height, width), colours in [0, 1], and its object mask in [0, 1].
 
-    The picture is turned by its EXIF orientation where only then it has that size. Where it is
-    transparent it shows `BACKGROUND` and no object, whatever the mask file says. There is no mask
-    where the picture is opaque and has no mask file.
+    The picture is turned by its EXIF orientation where only then it has that size, or if `upright`
+    where it has that size then. Where it is transparent it shows `BACKGROUND` and no object,
+    whatever the mask file says. There is no mask where the picture is opaque and has no mask file.
     """
-    picture = require_mode(read_turned(path, size, operator.eq), _EIGHT_BIT_MODES, path)
+    picture = require_mode(read_turned(path, size, operator.eq, upright), _EIGHT_BIT_MODES, path)
     alpha = None
     if picture.has_transparency_data:
         picture = picture.convert("RGBA")

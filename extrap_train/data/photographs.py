@@ -38,11 +38,14 @@ class PhotographLoader:
     """To be undone; None for a pinhole camera's photograph."""
     pinhole: Lens | None = None
     """That of `camera`, where there is a lens to undo."""
+    upright: bool = False
+    """Whether the camera holds the photograph as its EXIF orientation turns it."""
 
     def frame(self) -> Frame:
         """The photograph as a frame that has not been read yet."""
         parts = [str(self.lens)] if self.lens else []
         parts.append(f"depth in {self.depth.scale if self.depth else None}")
+        parts += ["upright"] if self.upright else []
         return Frame(
             name=self.name,
             camera=self.camera,
@@ -58,7 +61,7 @@ class PhotographLoader:
         size = self.camera.height, self.camera.width
         image_path = require_file(self.root / self.image_path)
         mask_path = require_file(self.root / self.mask_path) if self.mask_path else None
-        image, mask = read_photograph(image_path, size, mask_path)
+        image, mask = read_photograph(image_path, size, mask_path, self.upright)
         found = self.depth.read(self.root, size) if depth and self.depth else None
         return View(
             image=self._straighten(image.permute(1, 2, 0)).permute(2, 0, 1).contiguous(),
@@ -97,6 +100,7 @@ class Photograph:
     world_to_cam: Float[Tensor, "4 4"]
     depth: DepthFile | None = None
     mask_path: str | None = None
+    upright: bool = False
 
 
 @dataclass(frozen=True)
@@ -249,6 +253,7 @@ def _frame(root: Path, photo: Photograph, name: str, description: Path) -> Frame
         depth=photo.depth,
         lens=None if photo.lens.is_pinhole else photo.lens,
         pinhole=pinhole,
+        upright=photo.upright,
     ).frame()
 
 

@@ -4,6 +4,7 @@ the way their cameras hold them.
 
 import functools
 import logging
+import math
 import struct
 import warnings
 from collections.abc import Callable
@@ -26,7 +27,7 @@ DECODER_ERRORS = (
 )
 """What Pillow's decoders raise on damaged files."""
 
-_ORIENTATION_TAG = 0x0112
+_ORIENTATION_TAG, _EXIF_TAG, _FOCAL_LENGTH_35MM_TAG = 0x0112, 0x8769, 0xA405
 _QUARTER_TURNS = (5, 6, 7, 8)
 _TURN_BACK = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -108,19 +109,40 @@ def same_view(size: tuple[int, int], other: tuple[int, int]) -> bool:
     return scales[1] <= 1 and abs(scales[0] - scales[1]) <= rounding
 
 
+def upright_photograph(path: Path) -> tuple[tuple[int, int], float | None]:
+    """(height, width) once turned by the EXIF orientation, and the focal length that EXIF tells.
+
+    The latter in pixels, from the one that has the same angle of view on 35 mm film.
+    """
+    with open_picture(path) as picture:
+        _, size = _sizes(picture, _orientation(picture))
+        try:
+            exif = Image.Image.getexif(picture).get_ifd(_EXIF_TAG)
+            focal_mm = float(exif.get(_FOCAL_LENGTH_35MM_TAG, 0))
+        except DECODER_ERRORS:
+            focal_mm = 0.0
+    if not 0 < focal_mm < math.inf:
+        return size, None
+    return size, focal_mm / math.hypot(24, 36) * math.hypot(*size)
+
+
 def read_turned(
-    path: Path, size: tuple[int, int], fits: Callable[[tuple[int, int], tuple[int, int]], bool]
+    path: Path,
+    size: tuple[int, int],
+    fits: Callable[[tuple[int, int], tuple[int, int]], bool],
+    upright: bool = False,
 ) -> Image.Image:
     """The decoded picture, turned by its EXIF orientation where only then its size fits `size`.
 
-    Raises InputError where neither does. Where both do, it is taken as it is stored, with one
-    warning for each folder.
+    Raises InputError where neither does. Where both do, it is turned if `upright`, else taken as it
+    is stored, with one warning for each folder.
     """
     with open_picture(path) as picture:
         tag = _orientation(picture)
         # Before decoding: a header that lies about its size must not cost memory.
         stored, turned = _sizes(picture, tag)
-        as_stored, as_turned = fits(stored, size), fits(turned, size)
+        as_turned = fits(turned, size)
+        as_stored = fits(stored, size) and not (upright and as_turned)
         if not (as_stored or as_turned):
             turns = f", turned by its EXIF orientation {_text(turned)}," if turned != stored else ""
             raise InputError(
@@ -134,8 +156,8 @@ def read_turned(
             if tag == 1:
                 return picture
             # Pillow turns a TIFF by itself.
-            upright = picture if picture.format == "TIFF" else ImageOps.exif_transpose(picture)
-            return upright.transpose(_TURN_BACK[tag]) if as_stored else upright
+            straight = picture if picture.format == "TIFF" else ImageOps.exif_transpose(picture)
+            return straight.transpose(_TURN_BACK[tag]) if as_stored else straight
         except DECODER_ERRORS:
             raise InputError(
                 f"{path}: is truncated or damaged; restore it or remove its entry"

@@ -6,6 +6,7 @@ from extrap_train.config import SyntheticConfig
 from extrap_train.data.camera_check import CO3D_POSES, find_pose_fault
 from extrap_train.data.co3d import read_sequence
 from extrap_train.data.colmap_model import find_model, read_model
+from extrap_train.data.estimated_poses import find_pictures, read_unposed
 from extrap_train.data.sequences import FrameSequence
 from extrap_train.data.synthetic.capture import synthetic_sequence
 from extrap_train.data.transforms_json import TRANSFORMS, read_transforms
@@ -16,7 +17,7 @@ CO3D_SCHEME = "co3d:"
 SYNTHETIC_SCHEME = "synthetic:"
 KNOWN_FORMS = (
     "co3d:ROOT/category/sequence, a folder with a transforms.json, a folder with a COLMAP model "
-    "(sparse/0 beside images), or synthetic:category/0003"
+    "(sparse/0 beside images), a folder of photographs, or synthetic:category/0003"
 )
 
 
@@ -35,10 +36,13 @@ def open_scene(spec: str, synthetic: SyntheticConfig | None = None) -> FrameSequ
         raise InputError(f"scene {spec!r}: no such folder; give {KNOWN_FORMS}")
     if (folder / TRANSFORMS).is_file():
         return read_transforms(folder)
-    model = find_model(folder)
-    if model is None:
-        raise InputError(f"scene {spec!r}: holds neither kind of camera file; give {KNOWN_FORMS}")
-    return read_model(model, _images_folder(folder, model), folder.resolve().name)
+    name = folder.resolve().name
+    if model := find_model(folder):
+        return read_model(model, _images_folder(folder, model), name)
+    for place in (folder, folder / "images"):
+        if pictures := find_pictures(place):
+            return read_unposed(place, pictures, name)
+    raise InputError(f"scene {spec!r}: holds no camera file and no photographs; give {KNOWN_FORMS}")
 
 
 def scene_address(spec: str) -> str:

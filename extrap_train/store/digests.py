@@ -36,7 +36,8 @@ def file_digest(path: Path) -> str:
         stamp = _stamp(path)
         if stamp[0] < _LARGE_BYTES:
             return _hashed(path)
-        record = _cache_folder() / f"{hashlib.sha256(os.fsencode(path.resolve())).hexdigest()}.json"
+        name = hashlib.sha256(os.fsencode(path.resolve())).hexdigest()
+        record = cache_folder("digests") / f"{name}.json"
         known = _read_known(record)
         if known is not None and (known.path, known.stamp) == (str(path.resolve()), stamp):
             return known.sha256
@@ -91,9 +92,10 @@ def _stamp(path: Path) -> list[int]:
     return [found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino]
 
 
-def _cache_folder() -> Path:
+def cache_folder(kind: str) -> Path:
+    """Where this user keeps what can be computed again, by what it is."""
     given = os.environ.get("XDG_CACHE_HOME")
-    return Path(given or Path.home() / ".cache") / "extrap-train" / "digests"
+    return Path(given or Path.home() / ".cache") / "extrap-train" / kind
 
 
 def _read_known(record: Path) -> _Known | None:

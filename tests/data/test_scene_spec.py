@@ -33,7 +33,7 @@ def test_a_colmap_model(tmp_path, place):
     [
         ("synthetc:hydrant/0003", "no such folder; give co3d:ROOT/category/sequence"),
         ("{folder}/gone", "no such folder"),
-        ("{folder}", "holds neither kind of camera file"),
+        ("{folder}", "no camera file and no photographs"),
         ("co3d:cup/one", "is not co3d:ROOT/category/sequence"),
         ("co3d:{folder}/cup/one", "has no category 'cup'"),
     ],

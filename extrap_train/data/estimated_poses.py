@@ -1,0 +1,191 @@
+"""Photographs without cameras: cameras are estimated with pycolmap, once for each set of pictures.
+
+The world is centred on the cameras, and its unit is about the diagonal of the box around them
+(COLMAP's normalisation: the box leaves out the outer tenth on each side).
+"""
+
+import hashlib
+import importlib.util
+import json
+import logging
+import math
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from PIL import Image
+
+from extrap_train.data.camera_check import LONGEST_FOCAL, SHORTEST_FOCAL
+from extrap_train.data.colmap_files import read_model_cameras
+from extrap_train.data.colmap_model import read_model
+from extrap_train.data.images import read_photograph, to_eight_bits
+from extrap_train.data.listed_files import PICTURE_SUFFIXES
+from extrap_train.data.picture_files import upright_photograph
+from extrap_train.data.sequences import FrameSequence
+from extrap_train.data.structure_from_motion import (
+    LEAST_PICTURES,
+    MAX_FEATURES,
+    MAX_SIDE,
+    SEED,
+    SharedCamera,
+    count_steps,
+    write_job,
+)
+from extrap_train.errors import InputError
+from extrap_train.store.atomic import atomic_folder, remove_leftovers
+from extrap_train.store.digests import cache_folder, file_digest
+from extrap_train.store.manifest import MANIFEST, Manifest
+from extrap_train.store.records import write_record
+from extrap_train.terminal import progress
+
+MOST_PICTURES = 1000
+_SUFFIXES = (*PICTURE_SUFFIXES, ".heic", ".heif")
+_MOST_NAMED = 8
+_REMEDY = (
+    "take more pictures of the textured scene in small steps around it, or give a transforms.json "
+    "or COLMAP model"
+)
+
+log = logging.getLogger(__name__)
+
+
+def find_pictures(folder: Path) -> list[str]:
+    """The names of the pictures in a folder, which need not exist, in order."""
+    if not folder.is_dir():
+        return []
+    paths = (path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES)
+    return sorted(path.name for path in paths if not path.name.startswith(".") and path.is_file())
+
+
+def read_unposed(folder: Path, pictures: Sequence[str], name: str) -> FrameSequence:
+    """The capture of a folder's `pictures`, whose cameras are estimated and kept in the cache.
+
+    Pictures that cannot be read or placed are left out with one warning. InputError where fewer
+    than three are left, or where pycolmap is needed and missing.
+    """
+    if len(pictures) > MOST_PICTURES:
+        raise InputError(
+            f"{folder}: has {len(pictures)} photographs without cameras, and those of at most "
+            f"{MOST_PICTURES} are estimated; choose some, or run COLMAP yourself"
+        )
+    settings = {"max_side": MAX_SIDE, "max_features": MAX_FEATURES, "seed": SEED}
+    manifest = Manifest.of(settings, {name: file_digest(folder / name) for name in pictures})
+    content = json.dumps([manifest.options, sorted(manifest.inputs.items())])
+    key = hashlib.sha256(content.encode()).hexdigest()[:16]
+    plain_name = re.sub(r"[^\w.-]", "_", name)[:60]
+    stored = cache_folder("poses") / f"{plain_name}-{key}"
+    if not stored.is_dir():
+        remove_leftovers(stored.parent)
+        with atomic_folder(stored, Path.is_dir) as made:
+            _estimate(folder, pictures, made)
+            write_record(made / MANIFEST, manifest)
+        log.warning("%s: cameras estimated from the photographs are kept in %s", folder, stored)
+    sequence = read_model(stored / "sparse" / "0", folder, name, upright=True)
+    placed = {frame.name for frame in sequence.frames}
+    lost = [picture for picture in pictures if picture not in placed]
+    if lost:
+        more = f" and {len(lost) - _MOST_NAMED} more" if len(lost) > _MOST_NAMED else ""
+        log.warning(
+            "%s: %d of %d photographs could not be placed among the others and are left out: %s%s",
+            folder,
+            len(lost),
+            len(pictures),
+            ", ".join(lost[:_MOST_NAMED]),
+            more,
+        )
+    reasons = tuple(f"{folder / picture}: could not be placed among the others" for picture in lost)
+    return replace(sequence, left_out=reasons, listed=tuple(pictures))
+
+
+def _estimate(folder: Path, pictures: Sequence[str], made: Path) -> None:
+    """Write the model to `made/sparse/0`."""
+    if importlib.util.find_spec("pycolmap") is None:
+        raise InputError(
+            f"{folder}: holds photographs without cameras, and estimating these needs pycolmap; "
+            'pip install "extrap-train[poses]", or give a transforms.json or COLMAP model'
+        )
+    work = made / "work"
+    work.mkdir()
+    cameras = _write_grey(folder, pictures, work)
+    count = sum(len(camera.files) for camera in cameras)
+    if count < LEAST_PICTURES:
+        raise InputError(
+            f"{folder}: has {count} readable photographs and no cameras, which takes at least "
+            f"{LEAST_PICTURES} to estimate; add photographs, or a transforms.json or COLMAP model"
+        )
+    write_job(cameras, work)
+    _run(work, count)
+    model = work / "sparse" / "0"
+    if not (model / "images.bin").is_file():
+        raise InputError(
+            f"{folder}: its {count} photographs show too little in common to estimate their "
+            f"cameras; {_REMEDY}"
+        )
+    _require_plausible_focal(model, folder)
+    model.parent.rename(made / "sparse")
+    shutil.rmtree(work)
+
+
+def _write_grey(folder: Path, pictures: Sequence[str], work: Path) -> list[SharedCamera]:
+    """Upright grey pictures for features; those of one size and focal length share a camera."""
+    groups: dict[tuple[tuple[int, int], float | None], SharedCamera] = {}
+    with progress("reading photographs", len(pictures), "photographs") as bar:
+        for number, name in enumerate(pictures):
+            file = f"{number:04d}.pgm"
+            try:
+                size, focal = upright_photograph(folder / name)
+                image, _ = read_photograph(folder / name, size, upright=True)
+            except InputError as error:
+                log.warning("%s", error)
+                continue
+            grey = Image.fromarray(to_eight_bits(image).transpose(1, 2, 0)).convert("L")
+            grey.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.LANCZOS)
+            grey.save(work / file)
+            group = SharedCamera([], [], *size, focal and focal * grey.width / size[1])
+            camera = groups.setdefault((size, focal), group)
+            camera.names.append(name)
+            camera.files.append(file)
+            bar.advance()
+    return list(groups.values())
+
+
+def _run(work: Path, count: int) -> None:
+    """Run `structure_from_motion` on a job."""
+    module = "extrap_train.data.structure_from_motion"
+    command = [sys.executable, "-m", module, str(work), str(torch.get_num_threads())]
+    errors = work / "errors.txt"
+    with (
+        progress("estimating cameras", count_steps(count), "pictures and pairs") as bar,
+        errors.open("w") as stderr,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=stderr, text=True) as process,
+    ):
+        assert process.stdout is not None
+        try:
+            for line in process.stdout:
+                bar.advance(int(line))
+        except BaseException:
+            process.kill()
+            raise
+    if process.returncode:
+        said = errors.read_text(errors="replace").strip().splitlines() or ["no message"]
+        raise InputError(
+            f"pycolmap failed to estimate cameras ({said[-1][:200]}, exit status "
+            f"{process.returncode}); {_REMEDY}"
+        )
+
+
+def _require_plausible_focal(model: Path, folder: Path) -> None:
+    for camera in read_model_cameras(model / "cameras.bin").values():
+        focal, sides = camera.parameters[0], sorted((camera.height, camera.width))
+        plausible = SHORTEST_FOCAL * sides[0] <= focal <= LONGEST_FOCAL * sides[1]
+        if not (math.isfinite(focal) and plausible):
+            raise InputError(
+                f"{folder}: a focal length of {focal:.4g} pixels is estimated for photographs of "
+                f"{camera.width} x {camera.height}, which no lens has: they do not determine their "
+                f"cameras; {_REMEDY}"
+            )
