@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from data_prep.drop_summary import group_reasons
-from extrap_train.data.pair_examples import collate, linspace_indices, read_example
+from extrap_train.data.pair_examples import linspace_indices, pack, read_example
 from extrap_train.data.prepared import UNTOUCHED, Pairs, PreparedData
 from extrap_train.data.square_frames import held_out_mask
 from extrap_train.geometry.viewpoints import fit_orbit
@@ -197,7 +197,7 @@ def pair_sheet(data: PreparedData, chosen: list[int], path: Path) -> None:
     """
     pairs = data.pairs("train")
     examples = [read_example(data, pairs[index], data.is_corrected) for index in chosen]
-    batch = collate(examples, references=1)
+    batch = pack(examples, references=1).unpack()
     plain, moved = (
         warp_references(
             batch.reference_images,

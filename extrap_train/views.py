@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, TypeVar, cast
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float16, UInt8
 from torch import Tensor
 from torch.nn import functional
 
@@ -222,3 +222,41 @@ class PairBatch:
     def to(self, device: torch.device | str) -> "PairBatch":
         """The same batch on another device."""
         return combine([self], lambda tensors: tensors[0].to(device))
+
+
+@dataclass(frozen=True)
+class PackedBatch:
+    """A `PairBatch` on its way to a device, as frames are stored: a third of its bytes."""
+
+    image: UInt8[Tensor, "b 3 h w"]
+    camera: Camera
+    reference_images: UInt8[Tensor, "b k 3 h w"]
+    reference_cameras: Camera
+    reference_depths: Float16[Tensor, "b k h w"]
+    depth_unit: Float[Tensor, " b"]
+    reference_valid: Bool[Tensor, "b k"]
+    reference_flows: Float[Tensor, "b k 2 g g"] | None = None
+
+    def to(self, device: torch.device | str) -> "PackedBatch":
+        """The same batch on another device, which pinned memory reaches while others compute."""
+        return combine([self], lambda tensors: tensors[0].to(device, non_blocking=True))
+
+    def pin_memory(self) -> "PackedBatch":
+        """The same batch in memory that a GPU copies from by itself; a DataLoader asks for it."""
+        return combine([self], lambda tensors: tensors[0].pin_memory())
+
+    def unpack(self) -> PairBatch:
+        """Colours in [0, 1] and depth in scene units, in single precision."""
+        return PairBatch(
+            image=_colours(self.image),
+            camera=self.camera,
+            reference_images=_colours(self.reference_images),
+            reference_cameras=self.reference_cameras,
+            reference_depths=self.reference_depths.float() * self.depth_unit[:, None, None, None],
+            reference_valid=self.reference_valid,
+            reference_flows=self.reference_flows,
+        )
+
+
+def _colours(image: UInt8[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b 3 h w"]:
+    return image.float().div_(255)

@@ -12,8 +12,10 @@ from torch.nn import functional
 
 from data_prep.category_pairs import prepare_category
 from extrap_train.config import DatasetDepthConfig, FlowMatcherConfig, PrepConfig, SyntheticConfig
+from extrap_train.data.co3d import read_category
 from extrap_train.data.module import ValidationBatches
 from extrap_train.data.pair_examples import ExampleReader, linspace_indices
+from extrap_train.data.square_frames import object_square
 from extrap_train.diffusion.baselines import mean_filled_warp
 from extrap_train.geometry.warp import compute_warp
 from extrap_train.metrics import psnr, quantised
@@ -39,9 +41,13 @@ def _held_out(output: Path) -> tuple[PairBatch, Bool[Tensor, "b 1 h w"], Bool[Te
     reader, pairs = ExampleReader([prepared], "test", _REFERENCES), prepared.pairs("test")
     chosen = linspace_indices(len(reader), _VIEWS)
     batch = compute_warp(ValidationBatches(reader, chosen, _VIEWS)[0], _SIZE)
-    truths = [prepared.frames(pairs[i].sequence, [pairs[i].query]) for i in chosen]
-    depth = functional.avg_pool2d(torch.stack([depth for _, depth, _ in truths]), 2)
-    mask = functional.avg_pool2d(torch.stack([mask for _, _, mask in truths]), 2) > 0.5
+    captures = {s.name: s for s in read_category(output / "synthetic", "hydrant")}
+    frames = [
+        captures[pairs[i].sequence.split("/")[1]].frames[pairs[i].query].load() for i in chosen
+    ]
+    truths = [object_square(frame, PrepConfig().image_size) for frame in frames]
+    depth = functional.avg_pool2d(torch.stack([truth.depth for truth in truths])[:, None], 2)
+    mask = functional.avg_pool2d(torch.stack([truth.mask for truth in truths])[:, None], 2) > 0.5
     middles = torch.stack([d[m].median() for d, m in zip(depth, mask, strict=True)])
     return batch, mask, depth > _FAR * middles[:, None, None, None]
 

@@ -3,7 +3,8 @@
 import json
 import math
 import re
-from collections.abc import Mapping
+import zlib
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -12,17 +13,22 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
-from jaxtyping import Float, Shaped, UInt8
+from jaxtyping import Float, Float16, Shaped, UInt8
 from pydantic import TypeAdapter, ValidationError
 from torch import Tensor
 
+from extrap_train.data.frame_codec import decode_depth, decode_image, encode_depth, encode_image
 from extrap_train.data.paths import file_stamp
+from extrap_train.errors import InputError
 from extrap_train.store.atomic import atomic_folder, save_array
 from extrap_train.views import Camera, View
 
 FLOWS = "flows.npy"
 """Of the pairs of one sequence, beside their table: control vectors (`geometry.spline_flow`)."""
-IMAGES, DEPTHS, MASKS, CAMERAS = "images.npy", "depth.npy", "mask.npy", "frames.parquet"
+FRAMES, CAMERAS = "frames.npy", "frames.parquet"
+"""A sequence's encoded frames (`frame_codec`), one after the other, and their table."""
+REMEDY = "run data_prep again, which makes what is damaged once more"
+_PARTS = ("image", "depth")
 _KEY, _SIZES = b"key", b"sizes"
 _SAFE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}")
 
@@ -36,40 +42,94 @@ class SequenceFrames:
     images: UInt8[np.ndarray, "n h w 3"]
     depths: Float[np.ndarray, "n h w"]
     masks: UInt8[np.ndarray, "n h w"]
-    """255 is the object; 255 everywhere where the capture has no mask."""
+    """255 is the object; 255 everywhere where the capture has no mask. Not stored: they have placed
+    the square, and training reads none."""
+
+
+class FrameArchive:
+    """The frames of one sequence on disk, each decoded when it is asked for.
+
+    InputError where the file is not as long as the table says, or a frame is not what was written.
+    """
+
+    def __init__(self, folder: Path, table: pa.Table, side: int) -> None:
+        self._file, self._side = folder / FRAMES, side
+        sizes = np.stack([table[f"{part}_bytes"].to_numpy() for part in _PARTS], 1)
+        self._ends = sizes.astype(np.int64).cumsum().reshape(sizes.shape)
+        self._starts = self._ends - sizes
+        self._checksums = np.stack([table[f"{part}_crc32"].to_numpy() for part in _PARTS], 1)
+        self._content = map_array(self._file)
+        if self._content.dtype != np.uint8 or self._content.shape != (int(sizes.sum()),):
+            raise damaged_error(folder, f"{FRAMES} is not as long as it was")
+
+    def image(self, index: int) -> UInt8[Tensor, "3 h w"]:
+        """The photograph's bytes of colour."""
+        return torch.from_numpy(self._decoded(index, 0, decode_image))
+
+    def depth(self, index: int) -> Float16[Tensor, "h w"]:
+        """The depth map in the sequence's unit; 0 is unknown."""
+        return torch.from_numpy(self._decoded(index, 1, decode_depth))
+
+    def _decoded(
+        self, index: int, part: int, decode: Callable[[np.ndarray, int], np.ndarray]
+    ) -> np.ndarray:
+        content = np.asarray(self._content[self._starts[index, part] : self._ends[index, part]])
+        try:
+            if zlib.crc32(content.data) != self._checksums[index, part]:
+                raise ValueError("not what was written")
+            return decode(content, self._side)
+        except ValueError as error:
+            raise InputError(
+                f"{self._file} is damaged ({_PARTS[part]} of frame {index}: {error}); delete its "
+                "folder and run data_prep again"
+            ) from None
 
 
 @dataclass(frozen=True)
 class StoredFrames:
     """A prepared sequence's frames on disk, read one at a time."""
 
-    folder: Path
+    archive: FrameArchive
     camera: Camera
     depth_share: Float[np.ndarray, " n"]
     """Of each frame's pixels, how many have a depth."""
     depth_scale: float
 
     @classmethod
-    def open(cls, folder: Path, table: pa.Table) -> "StoredFrames":
-        """From the folder's table of cameras."""
-        height, width = np.load(folder / MASKS, mmap_mode="r").shape[1:]
+    def open(cls, folder: Path, table: pa.Table, side: int) -> "StoredFrames":
+        """From the folder's table of cameras; frames have `side` × `side` pixels."""
         camera = Camera(
             matrices_of(table, "world_to_cam", (4, 4)),
             matrices_of(table, "intrinsics", (3, 3)),
-            height,
-            width,
+            side,
+            side,
         )
         scale = float(table["depth_scale"][0].as_py())
-        return cls(folder, camera, table["depth_share"].to_numpy(), scale)
+        archive = FrameArchive(folder, table, side)
+        return cls(archive, camera, table["depth_share"].to_numpy(), scale)
 
     def view(self, index: int) -> View:
         """A frame with its depth in scene units; 0 is unknown."""
-        pixels, depth = (
-            torch.from_numpy(np.array(np.load(self.folder / name, mmap_mode="r")[index])).float()
-            for name in (IMAGES, DEPTHS)
-        )
-        image = pixels.permute(2, 0, 1).contiguous().div_(255)
-        return View(image, self.camera[index], depth.mul_(self.depth_scale))
+        image = self.archive.image(index).float().div_(255)
+        depth = self.archive.depth(index).float().mul_(self.depth_scale)
+        return View(image, self.camera[index], depth)
+
+
+def damaged_error(place: Path, what: str) -> InputError:
+    """What to say of prepared data that is not as it was written."""
+    return InputError(f"{place} is damaged ({what}); {REMEDY}")
+
+
+def map_array(file: Path) -> np.ndarray:
+    """An array on disk, of which no more is asked for than the file holds."""
+    try:
+        mapped: np.ndarray = np.load(file, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError, TypeError, OverflowError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise damaged_error(file.parent, f"{file.name}: {reason}") from None
+    if not isinstance(mapped, np.memmap):  # a zip archive
+        raise damaged_error(file.parent, f"{file.name} is no array")
+    return mapped
 
 
 def sequence_folder(root: Path, kind: str, sequence: str) -> Path:
@@ -106,8 +166,15 @@ def write_frames(place: "SealedTable", frames: SequenceFrames) -> None:
     scale = _depth_scale(frames.depths)
     scaled = frames.depths / scale
     scaled[scaled > np.finfo(np.float16).max] = 0
-    arrays = {IMAGES: frames.images, DEPTHS: scaled.astype(np.float16), MASKS: frames.masks}
-    place.write(_camera_table(frames, scale), arrays)
+    depths = scaled.astype(np.float16)
+    parts = [[encode_image(x) for x in frames.images], [encode_depth(x) for x in depths]]
+    table = _camera_table(frames, scale)
+    for part, contents in zip(_PARTS, parts, strict=True):
+        sizes, sums = [len(x) for x in contents], [zlib.crc32(x) for x in contents]
+        table = table.append_column(f"{part}_bytes", pa.array(sizes, pa.int32()))
+        table = table.append_column(f"{part}_crc32", pa.array(sums, pa.uint32()))
+    content = b"".join(image + depth for image, depth in zip(*parts, strict=True))
+    place.write(table, {FRAMES: np.frombuffer(content, np.uint8)})
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 from extrap_train.config import TrainConfig
 from extrap_train.data.pair_examples import Example, ExampleReader, linspace_indices, mirror
 from extrap_train.geometry.warp import compute_warp
-from extrap_train.views import PairBatch
+from extrap_train.views import PackedBatch, PairBatch
 
 Positions = list[tuple[int, int]]
 """(position in the endless stream of examples, index of the pair)."""
@@ -57,23 +57,23 @@ class PositionSampler(Sampler[Positions]):
         return np.random.default_rng((self.seed, cycle)).permutation(self.pairs)
 
 
-class TrainingBatches(Dataset[PairBatch]):
+class TrainingBatches(Dataset[PackedBatch]):
     """Whole batches by their positions: one to all of the reader's references, half mirrored."""
 
     def __init__(self, reader: ExampleReader, seed: int) -> None:
         self.reader, self.seed = reader, seed
 
-    def __getitem__(self, positions: Positions) -> PairBatch:
+    def __getitem__(self, positions: Positions) -> PackedBatch:
         examples: list[Example] = []
         for position, pair in positions:
             rng = np.random.default_rng((self.seed, position))
             count = int(rng.integers(1, self.reader.references + 1))
             example = self.reader.read(pair, count, rng)
             examples.append(mirror(example) if rng.random() < 0.5 else example)
-        return self.reader.collate(examples)
+        return self.reader.pack(examples)
 
 
-class ValidationBatches(Dataset[PairBatch]):
+class ValidationBatches(Dataset[PackedBatch]):
     """The same examples, with all their references, every time."""
 
     def __init__(self, reader: ExampleReader, chosen: list[int], size: int) -> None:
@@ -83,9 +83,9 @@ class ValidationBatches(Dataset[PairBatch]):
     def __len__(self) -> int:
         return len(self.batches)
 
-    def __getitem__(self, index: int) -> PairBatch:
+    def __getitem__(self, index: int) -> PackedBatch:
         read, count = self.reader.read, self.reader.references
-        return self.reader.collate(
+        return self.reader.pack(
             [read(pair, count, np.random.default_rng(pair)) for pair in self.batches[index]]
         )
 
@@ -107,7 +107,7 @@ class PairModule(lightning.LightningDataModule):
         """Steps from one checkpoint to the next."""
         return min(self.config.trainer.checkpoint_every, self.config.trainer.steps)
 
-    def train_dataloader(self) -> DataLoader[PairBatch]:
+    def train_dataloader(self) -> DataLoader[PackedBatch]:
         """The batches up to the next checkpoint, at a multiple of `batches_per_epoch` steps."""
         trainer = self.trainer
         done = trainer.global_step if trainer else 0
@@ -122,7 +122,7 @@ class PairModule(lightning.LightningDataModule):
         )
         return self._loader(TrainingBatches(self.train, self.config.seed), sampler)
 
-    def val_dataloader(self) -> DataLoader[PairBatch]:
+    def val_dataloader(self) -> DataLoader[PackedBatch]:
         """Held-out examples; processes take turns at them."""
         trainer = self.trainer
         rank, world = (trainer.global_rank, trainer.world_size) if trainer else (0, 1)
@@ -133,20 +133,22 @@ class PairModule(lightning.LightningDataModule):
         return [[self.validation.name(i) for i in batch] for batch in self.held_out.batches]
 
     def _loader(
-        self, dataset: Dataset[PairBatch], sampler: Sampler[Positions] | list[int]
-    ) -> DataLoader[PairBatch]:
+        self, dataset: Dataset[PackedBatch], sampler: Sampler[Positions] | list[int]
+    ) -> DataLoader[PackedBatch]:
         workers = self.config.trainer.workers
+        device = self.trainer.strategy.root_device.type if self.trainer else "cpu"
         return DataLoader(
             dataset,
             batch_size=None,
             sampler=sampler,
             num_workers=workers,
             persistent_workers=workers > 0,
+            pin_memory=device == "cuda",
         )
 
-    def on_after_batch_transfer(self, batch: PairBatch, dataloader_idx: int) -> PairBatch:
+    def on_after_batch_transfer(self, batch: PackedBatch, dataloader_idx: int) -> PairBatch:
         """Lightning's hook: warps are computed, not stored."""
-        return compute_warp(batch, self.config.model.image_size)
+        return compute_warp(batch.unpack(), self.config.model.image_size)
 
 
 def shard(batches: int, rank: int, world: int) -> list[int]:

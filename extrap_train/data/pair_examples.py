@@ -3,38 +3,45 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from extrap_train.data.prepared import PreparedData
 from extrap_train.geometry.viewpoints import extra_references, pairwise_angles, scene_center
-from extrap_train.views import Camera, PairBatch, ViewPair, stack_cameras
+from extrap_train.views import Camera, PackedBatch, PairBatch, ViewPair, stack_cameras
 
 
 @dataclass(frozen=True)
 class Example:
-    """A query and one to `k` references, nearest first."""
+    """A query and one to `k` references, nearest first.
 
-    image: Float[Tensor, "3 h w"]
+    Colours are in [0, 1], or bytes, as frames are stored, and depth then in units of `depth_unit`.
+    """
+
+    image: Shaped[Tensor, "3 h w"]
     camera: Camera
-    reference_images: Float[Tensor, "k 3 h w"]
+    reference_images: Shaped[Tensor, "k 3 h w"]
     reference_cameras: Camera
     reference_depths: Float[Tensor, "k h w"]
     reference_flows: Float[Tensor, "k 2 g g"] | None = None
+    depth_unit: float = 1.0
 
 
 def mirror(example: Example) -> Example:
     """The example in a mirror: left and right exchanged in images, cameras and world alike."""
-    return Example(
-        example.image.flip(-1),
-        _mirror_camera(example.camera),
-        example.reference_images.flip(-1),
-        _mirror_camera(example.reference_cameras),
-        example.reference_depths.flip(-1),
-        None if example.reference_flows is None else _mirror_flows(example.reference_flows),
+    flows = example.reference_flows
+    return replace(
+        example,
+        image=example.image.flip(-1),
+        camera=_mirror_camera(example.camera),
+        reference_images=example.reference_images.flip(-1),
+        reference_cameras=_mirror_camera(example.reference_cameras),
+        reference_depths=example.reference_depths.flip(-1),
+        reference_flows=None if flows is None else _mirror_flows(flows),
     )
 
 
@@ -54,20 +61,40 @@ def _mirror_camera(camera: Camera) -> Camera:
 
 def collate(examples: Sequence[Example], references: int) -> PairBatch:
     """A batch with room for `references`; missing ones are the first again, marked invalid."""
+    return PairBatch(**_stacked(examples, references))
+
+
+def pack(examples: Sequence[Example], references: int) -> PackedBatch:
+    """`collate` for examples as they are stored."""
+    units = torch.tensor([example.depth_unit for example in examples])
+    return PackedBatch(**_stacked(examples, references), depth_unit=units)
+
+
+def _stacked(examples: Sequence[Example], references: int) -> dict[str, Any]:
     orders = [
         [i if i < len(e.reference_images) else 0 for i in range(references)] for e in examples
     ]
     valid = [[i < len(e.reference_images) for i in range(references)] for e in examples]
     pairs = list(zip(examples, orders, strict=True))
-    return PairBatch(
-        image=torch.stack([e.image for e in examples]),
-        camera=stack_cameras([e.camera for e in examples]),
-        reference_images=torch.stack([e.reference_images[o] for e, o in pairs]),
-        reference_cameras=stack_cameras([e.reference_cameras[torch.tensor(o)] for e, o in pairs]),
-        reference_depths=torch.stack([e.reference_depths[o] for e, o in pairs]),
-        reference_valid=torch.tensor(valid),
-        reference_flows=_flows([(e.reference_flows, o) for e, o in pairs]),
-    )
+    return {
+        "image": torch.stack([e.image for e in examples]),
+        "camera": stack_cameras([e.camera for e in examples]),
+        "reference_images": _gathered([e.reference_images for e in examples], orders),
+        "reference_cameras": stack_cameras(
+            [e.reference_cameras[torch.tensor(o)] for e, o in pairs]
+        ),
+        "reference_depths": _gathered([e.reference_depths for e in examples], orders),
+        "reference_valid": torch.tensor(valid),
+        "reference_flows": _flows([(e.reference_flows, o) for e, o in pairs]),
+    }
+
+
+def _gathered(
+    parts: Sequence[Shaped[Tensor, "_ *c h w"]], orders: Sequence[Sequence[int]]
+) -> Shaped[Tensor, "b k *c h w"]:
+    """The chosen pictures of every example, each copied once."""
+    chosen = [part[i] for part, order in zip(parts, orders, strict=True) for i in order]
+    return torch.stack(chosen).unflatten(0, (len(parts), -1))
 
 
 def _flows(
@@ -82,12 +109,19 @@ def _flows(
 
 
 def read_example(data: PreparedData, pair: ViewPair, is_corrected: bool) -> Example:
-    """The pair's example with all its references, and with their flows if `is_corrected`."""
-    frames = [pair.query, *pair.references]
-    images, depths, _ = data.frames(pair.sequence, frames)
-    cameras = data.cameras(pair.sequence)[torch.tensor(frames)]
-    flows = data.flows(pair.sequence, pair.references, pair.query) if is_corrected else None
-    return Example(images[0], cameras[0], images[1:], cameras[1:], depths[1:], flows)
+    """The pair's example, as stored, with all its references, and their flows if `is_corrected`."""
+    sequence, frames = pair.sequence, [pair.query, *pair.references]
+    images = data.images(sequence, frames)
+    cameras = data.cameras(sequence)[torch.tensor(frames)]
+    return Example(
+        images[0],
+        cameras[0],
+        images[1:],
+        cameras[1:],
+        data.depths(sequence, pair.references),
+        data.flows(sequence, pair.references, pair.query) if is_corrected else None,
+        data.depth_unit(sequence),
+    )
 
 
 def linspace_indices(available: int, wanted: int) -> list[int]:
@@ -124,9 +158,9 @@ class ExampleReader:
         references = self._references(data, pair, count, rng)
         return read_example(data, replace(pair, references=references), self._is_corrected(data))
 
-    def collate(self, examples: list[Example]) -> PairBatch:
+    def pack(self, examples: list[Example]) -> PackedBatch:
         """A batch with room for the reader's number of references."""
-        return collate(examples, self.references)
+        return pack(examples, self.references)
 
     def _references(
         self, data: PreparedData, pair: ViewPair, count: int, rng: np.random.Generator

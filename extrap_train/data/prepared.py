@@ -1,11 +1,11 @@
-"""Prepared data on disk, as training reads it: pairs, cameras, and memory-mapped frames.
+"""Prepared data on disk, as training reads it: pairs, cameras, and frames, decoded one by one.
 
 <folder>/manifest.json       what it was made from; written last: marks a finished preparation
          sequences.parquet   one row per sequence, dropped ones with their reason
          frames.parquet      one row per frame: name, camera, whether it may serve as a reference
          pairs.parquet       one row per ordered pair (reference → query)
          split.json          test sequences (or frames), with a hash
-<frames>/frames/<category>/<sequence>/{images,depth,mask}.npy, frames.parquet
+<frames>/frames/<category>/<sequence>/frames.npy, frames.parquet
          lone_frames/…       of a sequence that is trained and tested on, with frames held out
 <pairs>/train_pairs/<category>/<sequence>/flows.npy, pairs.parquet
         test_pairs/…, train_and_test_pairs/…
@@ -25,15 +25,16 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float16, Int, UInt8
 from torch import Tensor
 
 from extrap_train.data.frame_files import (
-    DEPTHS,
     FLOWS,
-    IMAGES,
-    MASKS,
+    REMEDY,
+    FrameArchive,
+    damaged_error,
     frames_folder,
+    map_array,
     matrices_of,
     pairs_folder,
 )
@@ -41,19 +42,16 @@ from extrap_train.errors import InputError
 from extrap_train.store.records import read_record
 from extrap_train.views import Camera, ViewPair
 
-FORMAT = 4
+FORMAT = 5
 UNTOUCHED = -1
 """In place of the number of a flow: the warp of that pair stays as it is."""
 _REPEATED = ("sequence", "split", "uncorrected")
 """Columns whose words come again row after row: kept as codes, as a million pairs have two million
 such words, which would take a quarter of a gigabyte.
 """
-_REMEDY = "run data_prep again, which makes what is damaged once more"
 TABLES = ("sequences", "frames", "pairs")
 _OPEN_SEQUENCES = 128
-"""Sequences whose files stay open: four descriptors each, and a process has about a thousand."""
-
-Arrays = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Sequences whose files stay open: two descriptors each, and a process has about a thousand."""
 
 
 @dataclass(frozen=True)
@@ -132,6 +130,7 @@ class PreparedData:
         self._pairs = pairs
         self._world_to_cam = matrices_of(frames, "world_to_cam", (4, 4))
         self._intrinsics = matrices_of(frames, "intrinsics", (3, 3))
+        self._frames = frames
         self._depth_scale = frames["depth_scale"].to_numpy()
         self._reference = frames["reference"].to_numpy()
         self._names = frames["name"]
@@ -145,7 +144,9 @@ class PreparedData:
             self._read_flow_numbers
         )
         self._flows: Callable[[str], np.ndarray] = lru_cache(_OPEN_SEQUENCES)(self._open_flows)
-        self._arrays: Callable[[str], Arrays] = lru_cache(_OPEN_SEQUENCES)(self._open_arrays)
+        self._archive: Callable[[str], FrameArchive] = lru_cache(_OPEN_SEQUENCES)(
+            self._open_archive
+        )
 
     @classmethod
     def open(cls, folder: Path) -> "PreparedData":
@@ -161,7 +162,7 @@ class PreparedData:
                 tables["pairs"].to_pandas(),
             )
         except (KeyError, ValueError, TypeError, IndexError) as error:
-            raise _damaged_error(folder, f"a column is missing or odd: {error}") from None
+            raise damaged_error(folder, f"a column is missing or odd: {error}") from None
 
     def pairs(self, split: str) -> Pairs:
         """The pairs of `train` or `test`, sequence by sequence, best score first."""
@@ -184,18 +185,19 @@ class PreparedData:
         """The frames that may serve as references: not held out, and with some depth known."""
         return np.flatnonzero(self._reference[self._rows[sequence]])
 
-    def frames(
-        self, sequence: str, indices: Sequence[int]
-    ) -> tuple[Float[Tensor, "k 3 h w"], Float[Tensor, "k h w"], Float[Tensor, "k h w"]]:
-        """Images, depths and object masks of some frames."""
-        images, depths, masks = self._arrays(sequence)
-        chosen = list(indices)
-        scale = float(self._depth_scale[self._rows[sequence].start])
-        return (
-            torch.from_numpy(images[chosen]).permute(0, 3, 1, 2).contiguous().float().div_(255),
-            torch.from_numpy(depths[chosen]).float().mul_(scale),
-            torch.from_numpy(masks[chosen]).float().div_(255),
-        )
+    def images(self, sequence: str, indices: Sequence[int]) -> UInt8[Tensor, "k 3 h w"]:
+        """The colours of some frames, as bytes."""
+        archive = self._archive(sequence)
+        return torch.stack([archive.image(index) for index in indices])
+
+    def depths(self, sequence: str, indices: Sequence[int]) -> Float16[Tensor, "k h w"]:
+        """Depth of some frames in units of `depth_unit`; 0 is unknown."""
+        archive = self._archive(sequence)
+        return torch.stack([archive.depth(index) for index in indices])
+
+    def depth_unit(self, sequence: str) -> float:
+        """A sequence's unit of depth in scene units, a power of two."""
+        return float(self._depth_scale[self._rows[sequence].start])
 
     @property
     def is_corrected(self) -> bool:
@@ -233,25 +235,17 @@ class PreparedData:
     def _open_flows(self, sequence: str) -> np.ndarray:
         folder = pairs_folder(self._pairs_root, sequence, self.roles[sequence])
         grid = self.manifest["options"].get("correction_grid")
-        flows = _map_array(folder / FLOWS, folder)
+        flows = map_array(folder / FLOWS)
         if flows.shape[1:] != (2, grid, grid) or flows.dtype != np.float16:
-            raise _damaged_error(folder, f"flows are {flows.shape}")
+            raise damaged_error(folder, f"flows are {flows.shape}")
         return flows
 
-    def _open_arrays(self, sequence: str) -> Arrays:
+    def _open_archive(self, sequence: str) -> FrameArchive:
         is_lone = self.roles[sequence] == "train and test"
         folder = frames_folder(self._frames_root, sequence, is_lone)
-        count = self._rows[sequence].stop - self._rows[sequence].start
-        square = (count, self.image_size, self.image_size)
-        images, depths, masks = (
-            _map_array(folder / name, folder) for name in (IMAGES, DEPTHS, MASKS)
-        )
-        kinds = (images.dtype, depths.dtype, masks.dtype)
-        if images.shape != (*square, 3) or depths.shape != square or masks.shape != square:
-            raise _damaged_error(folder, f"frames are not {square}")
-        if kinds != (np.uint8, np.float16, np.uint8):
-            raise _damaged_error(folder, "frames are of other types")
-        return images, depths, masks
+        rows = self._rows[sequence]
+        table = self._frames.slice(rows.start, rows.stop - rows.start)
+        return FrameArchive(folder, table, self.image_size)
 
     def __reduce__(self) -> tuple[Callable[[Path], "PreparedData"], tuple[Path]]:
         """In another process the folder is opened anew: a pickled memory map would be a copy."""
@@ -263,10 +257,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     file = folder / "manifest.json"
     if not file.is_file():
         raise InputError(f"{folder}: holds no finished preparation; run data_prep again")
-    manifest = read_record(file, _Manifest, _REMEDY)
+    manifest = read_record(file, _Manifest, REMEDY)
     size = manifest.options.get("image_size")
     if manifest.format != FORMAT or type(size) is not int:
-        raise _damaged_error(folder, f"{file} is no manifest of format {FORMAT}")
+        raise damaged_error(folder, f"{file} is no manifest of format {FORMAT}")
     return asdict(manifest)
 
 
@@ -283,28 +277,13 @@ def _read_table(folder: Path, name: str, manifest: dict[str, Any]) -> pa.Table:
     """A table as it was written: what is damaged is never parsed."""
     file = folder / f"{name}.parquet"
     if table_digest(file) != manifest["tables"].get(name):
-        raise _damaged_error(folder, f"{file} is missing or was changed")
+        raise damaged_error(folder, f"{file} is missing or was changed")
     try:
         words = [name for name in _REPEATED if name in pq.read_schema(file).names]
         return pq.read_table(file, read_dictionary=words).combine_chunks()
     except (OSError, pa.ArrowException) as error:
         reason = str(error).splitlines()[0]
-        raise _damaged_error(folder, f"{file}: {reason}") from None
-
-
-def _damaged_error(folder: Path, what: str) -> InputError:
-    return InputError(f"{folder} is damaged ({what}); {_REMEDY}")
-
-
-def _map_array(file: Path, folder: Path) -> np.ndarray:
-    """An array on disk, of which no more is asked for than the file holds."""
-    try:
-        mapped: np.ndarray = np.load(file, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError, TypeError, OverflowError) as error:
-        raise _damaged_error(folder, f"{file.name}: {' '.join(str(error).split())[:200]}") from None
-    if not isinstance(mapped, np.memmap):  # a zip archive
-        raise _damaged_error(folder, f"{file.name} is no array")
-    return mapped
+        raise damaged_error(folder, f"{file}: {reason}") from None
 
 
 def _roles(sequences: pd.DataFrame) -> dict[str, str]:

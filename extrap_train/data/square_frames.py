@@ -27,7 +27,7 @@ MOST_UNUSABLE_SHARE = 0.1
 """Of a sequence's frames, beyond which the whole sequence is not trusted."""
 LEAST_FRAMES = 2
 """While so many are left, one unusable frame alone is no reason not to trust a sequence."""
-FRAMES_VERSION = 2
+FRAMES_VERSION = 3
 """Raised whenever the same photographs give other frames."""
 LOG = logging.getLogger(__name__)
 

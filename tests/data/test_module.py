@@ -1,6 +1,6 @@
 """Batches are a function of seed and position alone; a mirrored example is a consistent scene."""
 
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 
 import pytest
 import torch
@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from extrap_train.data.module import PositionSampler
-from extrap_train.data.pair_examples import Example, linspace_indices, mirror
+from extrap_train.data.pair_examples import Example, collate, linspace_indices, mirror, pack
 from extrap_train.geometry.warp import compute_warp
 from extrap_train.views import Camera, PairBatch
 
@@ -95,6 +95,59 @@ def test_the_warp_of_the_mirror_is_the_mirror_of_the_warp(wall_batch: PairBatch)
     both = (plain.mask * flipped.mask.flip(-1))[:, None]
     difference = ((plain.image - flipped.image.flip(-1)) * both).abs()
     assert float(difference.mean()) < 2e-3
+
+
+def test_a_packed_batch_is_the_batch_in_fewer_bytes(wall_batch: PairBatch) -> None:
+    """Bytes and half precision on the way, single precision where it arrives; of two examples, one
+    has a reference less and none of its flows.
+    """
+    stored, plain = [], []
+    for known, unit, flows in ((3, 0.25, torch.ones(3, 2, 4, 4)), (2, 4.0, None)):
+        example = _example(wall_batch)
+        colours = (example.image * 255).round(), (example.reference_images[:known] * 255).round()
+        depths = (example.reference_depths[:known] / unit).half()
+        shared = {"reference_cameras": example.reference_cameras[:known], "reference_flows": flows}
+        image, references = (x.to(torch.uint8) for x in colours)
+        stored.append(
+            replace(
+                example,
+                image=image,
+                reference_images=references,
+                reference_depths=depths,
+                depth_unit=unit,
+                **shared,
+            )
+        )
+        image, references = (x / 255 for x in colours)
+        plain.append(
+            replace(
+                example,
+                image=image,
+                reference_images=references,
+                reference_depths=depths.float() * unit,
+                **shared,
+            )
+        )
+    packed, batch = pack([mirror(x) for x in stored], 3), collate([mirror(x) for x in plain], 3)
+    assert packed.reference_valid.tolist() == [[True, True, True], [True, True, False]]
+    assert _bytes_of(packed.to("cpu")) < 0.35 * _bytes_of(batch)
+    for ours, expected in zip(_tensors(packed.unpack()), _tensors(batch), strict=True):
+        assert torch.equal(ours, expected)
+
+
+def _tensors(batch: object) -> list[torch.Tensor]:
+    found: list[torch.Tensor] = []
+    for field in fields(batch):
+        value = getattr(batch, field.name)
+        if isinstance(value, torch.Tensor):
+            found.append(value)
+        elif is_dataclass(value):
+            found += _tensors(value)
+    return found
+
+
+def _bytes_of(batch: object) -> int:
+    return sum(tensor.nbytes for tensor in _tensors(batch))
 
 
 def test_mirroring_twice_changes_nothing(wall_batch: PairBatch) -> None:

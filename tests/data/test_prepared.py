@@ -16,6 +16,7 @@ from extrap_train.config import PrepConfig
 from extrap_train.data.frame_files import (
     SealedTable,
     SequenceFrames,
+    StoredFrames,
     frames_folder,
     write_frames,
 )
@@ -45,12 +46,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_frames_come_as_they_went_in(folder: Path) -> None:
     data = PreparedData.open(folder)
-    images, depths, masks = data.frames("cup/b", [5, 0, 23])
+    images, depths = data.images("cup/b", [5, 0, 23]), data.depths("cup/b", [5, 0, 23])
     assert images.shape == (3, 3, SIZE, SIZE)
-    assert images.is_contiguous()
-    np.testing.assert_allclose(images[:, 0, 0, 0], [5 / 24, 0, 23 / 24], atol=0.5 / 255 + 1e-6)
-    np.testing.assert_allclose(depths, 2.5, rtol=2**-11)
-    assert (masks == 1).all()  # a capture without masks
+    np.testing.assert_allclose(images[:, 0, 0, 0] / 255, [5 / 24, 0, 23 / 24], atol=0.5 / 255)
+    np.testing.assert_allclose(depths * data.depth_unit("cup/b"), 2.5, rtol=2**-11)
     assert data.names("cup/b")[5] == "frame5"
 
 
@@ -83,7 +82,7 @@ def test_a_million_pairs_do_not_repeat_their_names(folder: Path) -> None:
 
 def test_another_process_gets_the_folder_not_the_frames(folder: Path) -> None:
     data = PreparedData.open(folder)
-    data.frames("cup/a", [0])
+    data.images("cup/a", [0])
     content = pickle.dumps(data)
     assert len(content) < 1000
     assert len(pickle.loads(content).pairs("train")) == len(data.pairs("train"))
@@ -103,8 +102,9 @@ def test_depth_survives_in_any_unit(exponent: float, seed: int, tmp_path_factory
     write_frames(place, frames)
     table = place.read()
     assert table is not None
-    stored = np.load(target / "depth.npy").astype(np.float32) * table["depth_scale"][0].as_py()
-    np.testing.assert_allclose(stored, depths, rtol=2**-11)
+    stored = StoredFrames.open(target, table, 4)
+    for index, depth in enumerate(depths):
+        np.testing.assert_allclose(stored.view(index).depth, depth, rtol=2**-11)
     assert SealedTable(place.file, "another key").read() is None
 
 
@@ -181,33 +181,47 @@ def test_a_manifest_of_other_types_or_sizes_is_damage(folder: Path, change: dict
     file.write_text(json.dumps(json.loads(whole) | change))
     try:
         with pytest.raises(InputError, match="damaged"):
-            PreparedData.open(folder).frames("cup/d", [0])
+            PreparedData.open(folder).images("cup/d", [0])
     finally:
         file.write_text(whole)
 
 
-@pytest.mark.parametrize("name", ["images.npy", "depth.npy", "mask.npy"])
 @pytest.mark.parametrize("shape", ["(4000000, 2000, 2000, 3)", "(2,)", "(-1, 5)", "0" * 99])
-def test_an_array_that_says_another_size_is_damage(folder: Path, name: str, shape: str) -> None:
+def test_an_array_that_says_another_size_is_damage(folder: Path, shape: str) -> None:
     """Before memory of that size is asked for."""
-    file = folder / "frames" / "cup" / "d" / name
+    file = folder / "frames" / "cup" / "d" / "frames.npy"
     whole = file.read_bytes()
     header = f"{{'descr': '|u1', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
     file.write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header.encode())
     try:
         with pytest.raises(InputError, match="damaged"):
-            PreparedData.open(folder).frames("cup/d", [0])
+            PreparedData.open(folder).images("cup/d", [0])
     finally:
         file.write_bytes(whole)
 
 
 def test_a_truncated_frame_file_is_damage(folder: Path) -> None:
-    file = folder / "frames" / "cup" / "d" / "depth.npy"
+    file = folder / "frames" / "cup" / "d" / "frames.npy"
     whole = file.read_bytes()
     file.write_bytes(whole[:1000])
     try:
         with pytest.raises(InputError, match="damaged"):
-            PreparedData.open(folder).frames("cup/d", [0])
+            PreparedData.open(folder).images("cup/d", [0])
+    finally:
+        file.write_bytes(whole)
+
+
+@pytest.mark.parametrize("place", [0.1, 0.5, 0.999])
+def test_a_changed_byte_is_found_when_its_frame_is_read(folder: Path, place: float) -> None:
+    """A JPEG with one would be another picture, and no error."""
+    file = folder / "frames" / "cup" / "d" / "frames.npy"
+    whole = file.read_bytes()
+    at = 128 + int(place * (len(whole) - 128))
+    file.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+    data = PreparedData.open(folder)
+    try:
+        with pytest.raises(InputError, match=r"frames\.npy is damaged .*frame \d+"):
+            _ = data.images("cup/d", range(24)), data.depths("cup/d", range(24))
     finally:
         file.write_bytes(whole)
 

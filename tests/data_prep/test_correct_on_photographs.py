@@ -61,11 +61,12 @@ def corrections(
     method, found = matcher(FlowMatcherConfig()), []
     for pair in list(data.pairs("train"))[::every]:
         (reference,), query = pair.references, pair.query
-        images, depths, _ = data.frames(pair.sequence, [reference, query])
+        images = data.images(pair.sequence, [reference, query]).float() / 255
+        depth = data.depths(pair.sequence, [reference])[0] * data.depth_unit(pair.sequence)
         cameras = data.cameras(pair.sequence)
         found.append(
             correct_pair(
-                View(images[0], cameras[reference], depths[0]),
+                View(images[0], cameras[reference], depth.float()),
                 View(truth(images[1]), cameras[query]),
                 method,
                 PrepConfig().correction_grid,

@@ -102,7 +102,7 @@ def test_a_killed_run_goes_on_and_ends_with_the_same_bytes(
     half = partial_path(frames / "s7")
     half = half.with_name(half.name.replace(f"-{os.getpid()}.", f"-{run.pid}."))
     half.mkdir()
-    (half / "images.npy").write_bytes(b"half of")
+    (half / "frames.npy").write_bytes(b"half of")
     finish(start(photographs, tmp_path))
     assert contents(tmp_path) == undisturbed
     assert {file: file.stat().st_mtime_ns for file in done} == done

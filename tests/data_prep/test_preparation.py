@@ -78,7 +78,7 @@ def test_other_pair_options_keep_the_frames_other_sizes_do_not(tmp_path: Path) -
     assert len(few.pairs("train")) < len(many.pairs("train"))
     assert len(depth.calls[0]) == 3
     large = run(tmp_path / "cup", captures(3), depth=depth, options=PrepConfig(image_size=20))
-    assert large.frames("cup/0001", [0])[0].shape == (1, 3, 20, 20)
+    assert large.images("cup/0001", [0]).shape == (1, 3, 20, 20)
     assert len(depth.calls[0]) == 6
 
 
@@ -105,7 +105,7 @@ def test_what_a_killed_run_has_half_written_is_removed(tmp_path: Path) -> None:
     for kind in ("frames", "pairs"):
         half = tmp_path / "cup" / kind / "cup" / f".0001.{killed}.tmp"
         half.mkdir(parents=True)
-        (half / "images.npy").write_bytes(b"half of it")
+        (half / "frames.npy").write_bytes(b"half of it")
     (tmp_path / "cup" / f".manifest.json.{killed}.tmp").write_bytes(b"{")
     run(tmp_path / "cup", captures(3))
     assert not list((tmp_path / "cup").rglob("*.tmp"))
@@ -193,7 +193,7 @@ def test_held_out_photographs_lend_no_depth(tmp_path: Path) -> None:
     data = run(tmp_path / "cup", captures(1), depth=depth)
     assert depth.calls[0] == [20], "24 frames, of which every fifth (4) is held out"
     (sequence,) = data.sequences["sequence"]
-    _, depths, _ = data.frames(sequence, list(range(24)))
+    depths = data.depths(sequence, list(range(24)))
     assert [i for i in range(24) if not depths[i].any()] == [4, 9, 14, 19]
 
 
@@ -209,9 +209,7 @@ def test_a_frame_without_depth_is_no_reference(tmp_path: Path) -> None:
     assert 6 not in data.reference_frames("cup/0000")
 
 
-@pytest.mark.parametrize(
-    ("module", "file"), [(frame_files, "IMAGES"), (frame_files, "MASKS"), (sequence_job, "FLOWS")]
-)
+@pytest.mark.parametrize(("module", "file"), [(frame_files, "FRAMES"), (sequence_job, "FLOWS")])
 def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
     module: ModuleType, file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -220,7 +218,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
         run(tmp_path / "cup", captures(2))
     assert str(tmp_path / "cup") in str(caught.value)
     made = [path for path in (tmp_path / "cup").rglob("*.npy") if path.is_file()]
-    assert len(made) == (3 if module is sequence_job else 0), "the frames of one sequence"
+    assert len(made) == (1 if module is sequence_job else 0), "the frames of one sequence"
     assert not list((tmp_path / "cup").rglob("*.tmp"))
 
 

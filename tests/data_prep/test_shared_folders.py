@@ -57,14 +57,14 @@ def test_a_lone_sequences_held_out_frames_stay_hidden_whoever_else_needs_them(
     assert strict.roles == {"cup/good": "train and test"}
     loose = run(tmp_path, "loose", sequences, replace(OPTIONS, min_viewpoint_quality=-1.0))
     assert sorted(loose.roles.values()) == ["test", "train"]
-    assert loose.frames("cup/good", HELD_OUT)[1].all()
+    assert loose.depths("cup/good", HELD_OUT).all()
     again = run(tmp_path, "strict", sequences, OPTIONS)
     assert f"{tmp_path / 'strict'}: prepared already" in capsys.readouterr().out
     for data in (strict, again):
-        assert not data.frames("cup/good", HELD_OUT)[1].any()
+        assert not data.depths("cup/good", HELD_OUT).any()
 
 
-@pytest.mark.parametrize("part", ["images.npy", "depth.npy", "frames.parquet", "flows.npy"])
+@pytest.mark.parametrize("part", ["frames.npy", "frames.parquet", "flows.npy"])
 @pytest.mark.parametrize("content", [None, b"", b"half of it"])
 def test_damage_is_noticed_and_mended_by_the_same_command(
     part: str, content: bytes | None, tmp_path: Path, caplog: pytest.LogCaptureFixture
@@ -80,7 +80,7 @@ def test_damage_is_noticed_and_mended_by_the_same_command(
         (folder / part).unlink()
     else:
         (folder / part).write_bytes(content)
-    run(tmp_path, "cup", sequences, options).frames("cup/b", range(9))
+    run(tmp_path, "cup", sequences, options).images("cup/b", range(9))
     assert "frames or pairs of 1 sequences (first: cup/b) are damaged" in caplog.text
     assert (folder / part).read_bytes() == whole
     after = times(tmp_path / "frames", tmp_path / "pairs")

@@ -147,7 +147,8 @@ def _prepared(folder: Path) -> Callable[[], object]:
         data = PreparedData.open(folder / "data")
         for split in ("train", "test"):
             for pair in list(data.pairs(split))[:2]:
-                data.frames(pair.sequence, [pair.query])
+                data.images(pair.sequence, [pair.query])
+                data.depths(pair.sequence, [pair.query])
                 data.flows(pair.sequence, pair.references, pair.query)
                 data.cameras(pair.sequence)
                 data.names(pair.sequence)

@@ -1,0 +1,79 @@
+"""A frame's bytes: depth comes back to the bit, a photograph as a JPEG of high quality has it."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from extrap_train.data.co3d import read_category
+from extrap_train.data.frame_codec import (
+    LOSSY_FROM,
+    decode_depth,
+    decode_image,
+    encode_depth,
+    encode_image,
+)
+from extrap_train.data.images import to_eight_bits
+from extrap_train.data.square_frames import object_square
+
+KILOBYTE = 1000
+CONTENTS = {
+    "empty": b"",
+    "text": b"no picture at all",
+    "a cut JPEG": encode_image(np.full((256, 256, 3), 99, np.uint8))[:200],
+    "a picture of another size": encode_image(np.zeros((32, 16, 3), np.uint8)),
+    "another kind of picture": cv2.imencode(".bmp", np.zeros((16, 16, 3), np.uint8))[1].tobytes(),
+    "a depth map of another size": encode_depth(np.zeros((8, 8), np.float16)),
+    "a larger depth map": encode_depth(np.zeros((64, 64), np.float16)),
+}
+
+
+def _bytes(content: bytes) -> np.ndarray:
+    return np.frombuffer(content, np.uint8)
+
+
+@given(bits=arrays(np.uint16, (5, 5)))
+@settings(max_examples=200, deadline=None)
+def test_any_depth_comes_back_to_the_bit(bits: np.ndarray) -> None:
+    """Infinities and what is no number among them."""
+    depth = bits.view(np.float16)
+    assert np.array_equal(decode_depth(_bytes(encode_depth(depth)), 5).view(np.uint16), bits)
+
+
+@given(pixels=arrays(np.uint8, (9, 9, 3)))
+@settings(max_examples=50, deadline=None)
+def test_a_small_photograph_comes_back_to_the_bit(pixels: np.ndarray) -> None:
+    assert np.array_equal(decode_image(_bytes(encode_image(pixels)), 9), pixels.transpose(2, 0, 1))
+
+
+@given(side=st.integers(LOSSY_FROM, 2 * LOSSY_FROM), seed=st.integers(0, 9))
+@settings(max_examples=5, deadline=None)
+def test_a_large_photograph_keeps_its_colours_and_their_order(side: int, seed: int) -> None:
+    coarse = np.random.default_rng(seed).integers(0, 255, (8, 8, 3)).astype(np.uint8)
+    image = cv2.resize(coarse, (side, side), interpolation=cv2.INTER_CUBIC)
+    again = decode_image(_bytes(encode_image(image)), side)
+    error = again.transpose(1, 2, 0).astype(float) - image
+    assert np.abs(error.mean((0, 1))).max() < 0.5
+    assert (error**2).mean() < 4
+
+
+@pytest.mark.parametrize("name", list(CONTENTS))
+@pytest.mark.parametrize("decode", [decode_image, decode_depth])
+def test_other_bytes_are_an_error(decode, name: str) -> None:
+    with pytest.raises(ValueError, match=r"16 x 16|no photograph"):
+        decode(_bytes(CONTENTS[name]), 16)
+
+
+@pytest.mark.parametrize("category", ["apple", "hydrant"])
+def test_frames_of_real_captures_stay_small(shared, category: str) -> None:
+    """Of 512 pixels: at most 140 kB, and 40 dB from the photograph they were made from."""
+    frame = read_category(shared / "data" / "co3d", category)[0].frames[0]
+    image = to_eight_bits(object_square(frame.load(depth=False), 512).image).transpose(1, 2, 0)
+    content = encode_image(np.ascontiguousarray(image))
+    again = torch.from_numpy(decode_image(_bytes(content), 512)).double()
+    error = (again - torch.from_numpy(image.transpose(2, 0, 1).copy())).square().mean()
+    assert len(content) < 140 * KILOBYTE
+    assert 10 * torch.log10(255**2 / error) > 40
