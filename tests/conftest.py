@@ -39,10 +39,16 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     """
     option = config.option
     files = all(Path(argument.split("::")[0]).is_file() for argument in config.args)
-    if files or option.markexpr == "slow" or option.capture == "no":
+    if files or option.markexpr in ("slow", "gpu") or option.capture == "no":
         return 0
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return min(cores or 1, _MOST_WORKERS)
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Tests that compare with a GPU are skipped where torch finds none."""
+    if item.get_closest_marker("gpu") and not torch.cuda.is_available():
+        pytest.skip(f"needs a CUDA device; torch {torch.__version__} finds none")
 
 
 @pytest.fixture(scope="session")

@@ -32,8 +32,9 @@ def test_gsplat_without_a_gpu_is_one_line():
         rasterizer("gsplat")
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device and gsplat")
+@pytest.mark.gpu
 def test_gsplat_is_equal():
+    pytest.importorskip("gsplat")
     inputs = [x.requires_grad_() for x in cube_of_gaussians(500)]
     camera = orbit_camera(20.0, SIZE)
     results = []

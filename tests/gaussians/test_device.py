@@ -160,10 +160,11 @@ def test_a_camera_that_was_left_behind_is_seen(
         replace(METHODS["3dgs"], rasterizer="gsplat").fit_scene(inputs)
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device and gsplat")
+@pytest.mark.gpu
 @pytest.mark.parametrize("name", METHODS)
 def test_gsplat_learns_as_much(name: str) -> None:
     """Not bit by bit: its sums have no fixed order."""
+    pytest.importorskip("gsplat")
     inputs, truth = scene_inputs(size=24)
     here = METHODS[name].fit_scene(inputs)
     there = replace(METHODS[name], rasterizer="gsplat").fit_scene(inputs)
