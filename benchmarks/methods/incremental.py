@@ -16,6 +16,7 @@ from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.geometry.world_frame import WorldFrame
 from extrap_train.reconstruction.cloud import cloud_of
 from extrap_train.reconstruction.completion import CompletionPipeline, Step, complete, map_of_inputs
+from extrap_train.reconstruction.fusion import fuse_depths
 from extrap_train.reconstruction.global_map import GENERATED, GlobalMap
 from extrap_train.reconstruction.inputs import first_views, fit_world_frame
 from extrap_train.reconstruction.planner import Query
@@ -90,7 +91,7 @@ class _Remembering:
 
 def _points(known: GlobalMap, world: WorldFrame, options: CompletionConfig) -> Float[Tensor, "m 3"]:
     """The map's points that are sure enough, in the photographs' world."""
-    cloud = cloud_of(known, votes=options.confidence.votes)
+    cloud = cloud_of(fuse_depths(known), votes=options.confidence.votes)
     return world.points_outside(
         cloud[cloud.confidence >= options.confidence.least_confidence].points
     )

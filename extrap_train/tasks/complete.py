@@ -32,6 +32,7 @@ from extrap_train.reconstruction.completion import CompletionPipeline, Step, com
 from extrap_train.reconstruction.depth_completion.inference import NetworkCompletion
 from extrap_train.reconstruction.depth_completion.network import load_depth_network
 from extrap_train.reconstruction.exact import ExactDepth, ExactGenerator
+from extrap_train.reconstruction.fusion import fuse_depths
 from extrap_train.reconstruction.global_map import GlobalMap, MapView
 from extrap_train.reconstruction.inputs import (
     check_cameras,
@@ -325,4 +326,7 @@ def _completed(
                 viewer.show(grown)
             bar.advance()
 
-        return complete(known, queries, pipeline, on_step)
+        known = fuse_depths(complete(known, queries, pipeline, on_step))
+    if viewer is not None:
+        viewer.show(known)
+    return known
