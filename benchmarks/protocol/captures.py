@@ -22,13 +22,14 @@ from extrap_train.config import (
 from extrap_train.data.co3d import read_category
 from extrap_train.data.json_files import read_json, require_list
 from extrap_train.data.photographs import CATEGORY as NO_CATEGORY
-from extrap_train.data.scene_spec import open_scene
+from extrap_train.data.scene_spec import SYNTHETIC_SCHEME, open_scene
 from extrap_train.data.sequences import FrameSequence
 from extrap_train.data.synthetic import build_scene, surface_points
 from extrap_train.data.synthetic.capture import synthetic_sequence
 from extrap_train.data.transforms_json import TRANSFORMS, read_transforms
+from extrap_train.diffusion.model_files import ancestors
 from extrap_train.errors import InputError
-from extrap_train.store.manifest import MANIFEST, Split, read_manifest
+from extrap_train.store.manifest import Split
 from extrap_train.views import stack_poses
 
 CLOUD_POINTS = 20_000
@@ -48,19 +49,23 @@ class TrainedModel:
     """A method's model whose run records what it was trained on."""
 
     method: str
-    run: Path
+    model: str
+    """Its folder, or the name of a packaged one."""
     category: str
     split: Split
+    is_start: bool
+    """Whether the method's weights only started from this model."""
 
-    def require_unseen(self, captures: Iterable[FrameSequence]) -> None:
-        """InputError for the first capture that the model was trained on.
+    def require_unseen(self, category: str, capture: Split) -> None:
+        """InputError for a capture, as the split that holds it out, that the model has seen.
 
-        By name alone: CO3D's are unique, whatever category a table gives them.
+        CO3D's names are unique, whatever category a table gives them; those of rendered captures
+        count within their category.
         """
-        tested = Split("co3d", (), tuple(capture.name for capture in captures))
-        if leaked := tested.leaked_from(self.split):
+        is_own = category == self.category or capture.source != "synthetic"
+        if is_own and (leaked := capture.leaked_from(self.split)):
             raise InputError(
-                f"options.{self.method}.weights: {self.run} was trained on the capture "
+                f"options.{self.method}.weights: {self.model} was trained on the capture "
                 f"{leaked[0]}; test on others, or give weights that have not seen it"
             )
 
@@ -68,9 +73,10 @@ class TrainedModel:
 def trained_models(
     methods: Iterable[MethodConfig], categories: Collection[str]
 ) -> list[TrainedModel]:
-    """The models of CO3D captures among the methods' `weights` that lie in their runs.
+    """The models that the methods' `weights` name, and those that they started from, as far as it
+    is known what they were trained on.
 
-    The catalogue checks which rendered captures models may be tested on.
+    Where no weights are named, the packaged ones are used: the catalogue checks their captures.
     """
     found = []
     for method in methods:
@@ -78,11 +84,12 @@ def trained_models(
         if not isinstance(weights, str):
             continue
         for folder in sorted({weights.replace("{category}", c) for c in categories or [""]}):
-            run = Path(folder).resolve().parent
-            if (run / MANIFEST).is_file():
-                splits = read_manifest(run, "restore it").split
-                found += [TrainedModel(method.name, run, c, split) for c, split in splits.items()]
-    return [model for model in found if model.split.source == "co3d"]
+            for model, manifest in ancestors(folder):
+                found += [
+                    TrainedModel(method.name, model, category, split, is_start=model != folder)
+                    for category, split in manifest.split.items()
+                ]
+    return found
 
 
 def _held_out_by_all(
@@ -91,12 +98,14 @@ def _held_out_by_all(
     """Up to `count` test captures that every model of a category holds out, in the order of a
     split; None where there is no model of it. Raises InputError where there are none.
     """
-    models = [model for model in models if model.category == category]
-    if not models:
+    models = [m for m in models if m.category == category and m.split.source == "co3d"]
+    tested = [model.split.test for model in models if not model.is_start]
+    if not tested:
         return None
-    common = set(present).intersection(*(model.split.test for model in models))
+    seen = {name for model in models for name in model.split.train}
+    common = set(present).intersection(*tested) - seen
     if not common:
-        runs = " and ".join(sorted({str(model.run) for model in models}))
+        runs = " and ".join(sorted({model.model for model in models}))
         raise InputError(
             f"{category}: none of the {len(present)} captures is held out by {runs}; test on "
             "other captures, or train with more data.test_sequences"
@@ -112,10 +121,20 @@ def open_captures(
     Raises InputError for a capture that one of the `models` was trained on.
     """
     captures = _open(config, categories, models)
-    if config.source != "synthetic":
+    for index, capture in enumerate(captures):
+        tested = _held_out(config, index, capture.sequence.name)
         for model in models:
-            model.require_unseen(capture.sequence for capture in captures)
+            model.require_unseen(capture.sequence.category, tested)
     return captures
+
+
+def _held_out(config: CapturesConfig, index: int, name: str) -> Split:
+    """One of a table's captures as the split that holds it out."""
+    if config.source == "synthetic":
+        return Split("synthetic", (), (name,), config.seed)
+    if config.source == "scenes" and config.scenes[index].startswith(SYNTHETIC_SCHEME):
+        return Split("synthetic", (), (name,), SyntheticConfig().seed)
+    return Split("co3d", (), (name,))
 
 
 def _open(

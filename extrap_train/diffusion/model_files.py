@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from extrap_train.diffusion.published.read import SOURCES, Shapes, read_publishe
 from extrap_train.diffusion.transfer import narrowed, turned_pose, widened
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import atomic_folder
+from extrap_train.store.manifest import MANIFEST, Manifest, read_manifest
 from extrap_train.store.records import read_record, write_record
 from extrap_train.weight_files import WeightFile, write_tensors
 
@@ -131,6 +132,22 @@ def saved_config(folder: Path) -> ModelConfig:
     except InputError as error:
         raise InputError(f"{file}: no model of this project ({error}); {_REMEDY}") from None
     return config
+
+
+def ancestors(start: str | None) -> Iterator[tuple[str, Manifest]]:
+    """Each model that the start goes back to with its manifest, as far as they have one.
+
+    Published weights have none; they were trained on other data sets.
+    """
+    known: set[str] = set()
+    while start is not None and start not in known:
+        known.add(start)
+        folder = packaged_weights(start) if start in packaged_names() else Path(start)
+        if not is_own(folder):
+            return
+        if (folder.resolve().parent / MANIFEST).is_file():
+            yield start, read_manifest(folder.resolve().parent, "restore it from its run")
+        start = saved_config(folder).start
 
 
 def load_weights(

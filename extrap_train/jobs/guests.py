@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
+from itertools import islice
 from multiprocessing import reduction
 from multiprocessing.connection import wait as wait_for_any
 from multiprocessing.process import BaseProcess
@@ -66,12 +67,10 @@ class GuestLauncher:
         running: dict[int, tuple[int, _Guest]] = {}
         with ExitStack() as ends_all:
             while True:
-                for index, item in waiting:
+                for index, item in islice(waiting, workers - len(running)):
                     guest = _Guest(self._start, job, item, self.timeout_s)
                     ends_all.callback(guest.end)
                     running[guest.process.sentinel] = (index, guest)
-                    if len(running) >= workers:
-                        break
                 if not running:
                     return
                 wait_for_any([*running], timeout=1.0)

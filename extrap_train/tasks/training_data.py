@@ -1,16 +1,14 @@
 """The pairs that a category is trained on and measured on: no capture may be on both sides."""
 
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 
-from extrap_train.config import TrainConfig, packaged_names
+from extrap_train.config import TrainConfig
 from extrap_train.data.module import PairModule
 from extrap_train.data.pair_examples import ExampleReader
 from extrap_train.data.prepared import PreparedData
-from extrap_train.diffusion.model_files import is_own, saved_config
-from extrap_train.diffusion.packaged import packaged_weights
+from extrap_train.diffusion.model_files import ancestors
 from extrap_train.errors import InputError
-from extrap_train.store.manifest import MANIFEST, Manifest, read_manifest
+from extrap_train.store.manifest import Manifest
 
 Prepare = Callable[[TrainConfig], list[PreparedData]]
 """Prepares every member of the category, or finds what was prepared before."""
@@ -32,7 +30,7 @@ def data_module(config: TrainConfig, prepared: list[PreparedData]) -> PairModule
 
 def require_unseen(start: str | None, manifest: Manifest) -> None:
     """Raise InputError if a held-out capture is one that the start (`model.start`) has seen."""
-    for model, seen in _ancestors(start):
+    for model, seen in ancestors(start):
         for category, names in manifest.leaked_from(seen).items():
             through = "" if model == start else f", by way of {model}"
             first = seen.split[category].train[0]
@@ -45,22 +43,6 @@ def require_unseen(start: str | None, manifest: Manifest) -> None:
 
 
 _OTHERS = "hold out others (data.test_sequences, data.set_list)"
-
-
-def _ancestors(start: str | None) -> Iterator[tuple[str, Manifest]]:
-    """Each model that the start goes back to with its manifest, as far as they have one.
-
-    Published weights have none; they were trained on other data sets.
-    """
-    known: set[str] = set()
-    while start is not None and start not in known:
-        known.add(start)
-        folder = packaged_weights(start) if start in packaged_names() else Path(start)
-        if not is_own(folder):
-            return
-        if (folder.resolve().parent / MANIFEST).is_file():
-            yield start, read_manifest(folder.resolve().parent, "restore it from its run")
-        start = saved_config(folder).start
 
 
 def _listed(names: list[str]) -> str:

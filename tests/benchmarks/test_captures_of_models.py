@@ -6,7 +6,13 @@ import pytest
 
 from benchmarks.protocol.captures import TrainedModel, open_captures, trained_models
 from data_prep.split import split_sequences
-from extrap_train.config import CapturesConfig, MethodConfig
+from extrap_train.config import (
+    MODEL_CONFIG,
+    CapturesConfig,
+    MethodConfig,
+    ModelConfig,
+    SyntheticConfig,
+)
 from extrap_train.errors import InputError
 from extrap_train.store.manifest import MANIFEST, Manifest, Split
 from extrap_train.store.records import write_record
@@ -22,17 +28,24 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-def _models(
-    folder: Path, test: tuple[str, ...], source: str = "co3d", weights: str | None = None
-) -> list[TrainedModel]:
+def _write_run(folder: Path, split: Split, start: str | None = None) -> str:
+    """What a run of cups leaves of its model and what it was trained on; the model's folder."""
+    (model := folder / "cup-run" / "model").mkdir(parents=True)
+    write_record(folder / "cup-run" / MANIFEST, Manifest.of({}, {}, {"cup": split}))
+    write_record(model / MODEL_CONFIG, ModelConfig(start=start))
+    return str(model)
+
+
+def _models_of(weights: str) -> list[TrainedModel]:
+    method = MethodConfig("mine", factory="a.B", options={"weights": weights})
+    return trained_models([method, MethodConfig("other", factory="a.C")], ["cup"])
+
+
+def _models(folder: Path, test: tuple[str, ...]) -> list[TrainedModel]:
     """Of a method with the weights of a run that has held out these captures."""
     train = tuple(name for name in _NAMES if name not in test)
-    run = folder / "cup-run"
-    run.mkdir(parents=True)
-    write_record(run / MANIFEST, Manifest.of({}, {}, {"cup": Split(source, train, test)}))
-    given = weights or str(folder / "{category}-run" / "model")
-    method = MethodConfig("mine", factory="a.B", options={"weights": given})
-    return trained_models([method, MethodConfig("other", factory="a.C")], ["cup"])
+    _write_run(folder, Split("co3d", train, test))
+    return _models_of(str(folder / "{category}-run" / "model"))
 
 
 def _captures(root: Path, models: list[TrainedModel], count: int = 2) -> list[str]:
@@ -53,7 +66,9 @@ def test_no_more_are_taken_than_asked_for(root: Path, tmp_path: Path) -> None:
 
 def test_two_runs_that_hold_out_nothing_in_common_are_refused(root: Path, tmp_path: Path) -> None:
     models = [*_models(tmp_path / "1", ("a", "b")), *_models(tmp_path / "2", ("c",))]
-    with pytest.raises(InputError, match=r"cup: none of the 6 .*1/cup-run and .*2/cup-run"):
+    with pytest.raises(
+        InputError, match=r"cup: none of the 6 .*1/cup-run/model and .*2/cup-run/model"
+    ):
         _captures(root, models)
 
 
@@ -62,13 +77,50 @@ def test_a_named_capture_that_was_trained_on_is_refused(root: Path, tmp_path: Pa
     config = CapturesConfig(source="scenes", scenes=[f"co3d:{root}/cup/a"])
     assert len(open_captures(config, ["cup"], models)) == 1
     config.scenes.append(f"co3d:{root}/cup/b")
-    with pytest.raises(InputError, match=r"options\.mine\.weights.*cup-run was trained on .* b;"):
+    with pytest.raises(
+        InputError, match=r"options\.mine\.weights.*cup-run/model was trained on .* b;"
+    ):
         open_captures(config, ["cup"], models)
 
 
-def test_runs_of_rendered_captures_say_nothing_of_photographs(tmp_path: Path) -> None:
-    assert not _models(tmp_path, ("a",), source="synthetic")
+def test_a_capture_that_the_weights_started_from_has_seen_is_refused(
+    root: Path, tmp_path: Path
+) -> None:
+    start = _write_run(tmp_path / "start", Split("co3d", ("a", "c"), ("e",)))
+    tuned = _write_run(tmp_path / "tuned", Split("co3d", ("d",), ("a", "b", "f")), start)
+    models = _models_of(tuned)
+    assert set(_captures(root, models, count=6)) == {"b", "f"}
+    config = CapturesConfig(source="scenes", scenes=[f"co3d:{root}/cup/c"])
+    with pytest.raises(InputError, match=r"start/cup-run/model was trained on the capture c;"):
+        open_captures(config, ["cup"], models)
 
 
-def test_packaged_weights_say_nothing(tmp_path: Path) -> None:
-    assert not _models(tmp_path, ("a",), weights="base")
+def test_rendered_captures_that_a_run_was_trained_on_are_refused(tmp_path: Path) -> None:
+    split = Split("synthetic", ("0001", "0002"), ("0000",), seed=7)
+    models = _models_of(_write_run(tmp_path, split))
+
+    def open_rendered(categories: list[str], sequences: int = 1, seed: int = 7) -> None:
+        config = CapturesConfig(source="synthetic", sequences=sequences, seed=seed)
+        open_captures(config, categories, models)
+
+    open_rendered(["cup"])
+    open_rendered(["cup"], sequences=2, seed=8)
+    open_rendered(["book"], sequences=2)
+    with pytest.raises(InputError, match=r"cup-run/model was trained on the capture 0001;"):
+        open_rendered(["cup"], sequences=2)
+
+
+def test_rendered_scenes_that_a_run_was_trained_on_are_refused(root: Path, tmp_path: Path) -> None:
+    usual = SyntheticConfig().seed
+    models = _models_of(_write_run(tmp_path, Split("synthetic", ("0001", "a"), ("0002",), usual)))
+    config = CapturesConfig(source="scenes", scenes=["synthetic:cup/0002", f"co3d:{root}/cup/a"])
+    assert len(open_captures(config, ["cup"], models)) == 2
+    config.scenes.append("synthetic:cup/0001")
+    with pytest.raises(InputError, match=r"cup-run/model was trained on the capture 0001;"):
+        open_captures(config, ["cup"], models)
+
+
+def test_a_packaged_model_says_what_it_was_trained_on() -> None:
+    config = CapturesConfig(source="synthetic", sequences=SyntheticConfig().test_sequences + 1)
+    with pytest.raises(InputError, match=r"options\.mine\.weights: base was trained on"):
+        open_captures(config, ["cup"], _models_of("base"))
