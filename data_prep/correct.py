@@ -28,8 +28,8 @@ LEAST_MATCHES = 40
 """Fewer do not tell a smooth motion from chance."""
 LARGEST_ACROSS = 0.006
 """Median distance of the matches from their points' epipolar lines, as a share of the picture's
-longer side (0.75 px of 128). Wrong depths give none, real poses and matchers half of it, and chance
-as much across the lines as along them: twice of it and more (docs/preparation.md)."""
+longer side (0.75 px of 128). Correct depths give 0, real poses and matchers about half of this
+limit, chance at least twice of it (docs/preparation.md)."""
 LEAST_INLIERS = 0.5
 """Share of the matches that a smooth motion must explain."""
 LEAST_STEP = 0.1
@@ -52,8 +52,11 @@ class Correction:
     flow: Float[Tensor, "2 g g"] | None
     """Control vectors (`geometry.spline_flow`); None where the warp stays as it is."""
     error_before: float
-    """Photometric error of the warp against the truth, over what the warp shows; NaN of none."""
+    """Photometric error of the warp against the truth; NaN of none. Over what the warp shows, and
+    once it is corrected over what both warps show.
+    """
     error_after: float
+    """The same with the correction; `error_before` where there is none."""
     reason: str = ""
     """Why the warp stays as it is."""
 

@@ -231,7 +231,9 @@ def require_same_options(folder: RunFolder, config: TrainConfig) -> None:
 
 
 def write_options(folder: RunFolder, config: TrainConfig, *, at_least: int) -> None:
-    """Write `config.yaml`; a run that has learnt for more steps than asked stays a longer one."""
+    """Write `config.yaml`; if the run was already trained for more steps than asked, that
+    number is kept.
+    """
     options = _all_options(config)
     options["trainer"]["steps"] = max(config.trainer.steps, at_least)
     write_atomic(folder.options, yaml.safe_dump(options, sort_keys=False).encode())

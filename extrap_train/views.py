@@ -217,7 +217,7 @@ class PairBatch:
     """Where each reference's warp really belongs (`geometry.spline_flow`); None leaves all where
     they are."""
     warp: Warp | None = None
-    """Made from the references when the batch is made; None before."""
+    """Made by `geometry.warp.compute_warp` once the batch is on its device; None until then."""
 
     def to(self, device: torch.device | str) -> "PairBatch":
         """The same batch on another device."""

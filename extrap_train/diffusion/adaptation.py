@@ -69,8 +69,9 @@ def adapt(
     to what it generated before: few photographs say what surfaces look like here, but not what lies
     in other directions. The inputs' own pairs are learnt whole, as in the paper.
 
-    Candidates are moving averages: the base is one, and single steps away from it are noisier than
-    what they learn. The best has the least error on the held-out pairs, measured with fixed noise
+    Candidates for the best weights are moving averages over the steps, because single steps are
+    noisier than the progress between them; the base's own weights are the first candidate. The best
+    has the least error on the held-out pairs, measured with fixed noise
     at levels that the sampler steps through: fewer of them where measuring all would take more than
     a tenth of the budget. `on_step` hears of step 0, the base measured, and of every step, with the
     share of the budget that is spent. Steps are a function of the seed; how many depends on the

@@ -1,4 +1,4 @@
-"""What a training run shows on its way: averaged weights, a table of metrics, a progress bar."""
+"""Lightning callbacks of a training run: averaged weights, metrics table, progress bar."""
 
 import csv
 import io

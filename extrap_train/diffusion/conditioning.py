@@ -29,7 +29,7 @@ class Null:
 
 @dataclass(frozen=True)
 class Conditioning:
-    """One query's condition; `zeroed` makes the null condition of classifier-free guidance."""
+    """A batch's condition; `zeroed` makes the null condition of classifier-free guidance."""
 
     latents: Float[Tensor, "b c h w"]
     """Everything that is concatenated behind the noisy latent."""

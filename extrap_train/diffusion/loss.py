@@ -92,9 +92,9 @@ def snr_weights(
     """Min-SNR-γ: the error of the clean sample weighed by min(SNR, γ) (Hang et al. 2023).
 
     In terms of ε that is min(SNR, γ)/SNR, of v min(SNR, γ)/(SNR + 1). With zero terminal SNR that
-    would leave the noisiest step, where sampling starts, without any weight: there it is
-    min(SNR + 1, γ), which is v's even weight (Lin et al. 2023) under the same bound, and what
-    Salimans and Ho 2022 give few-step models for this reason.
+    would leave the noisiest step, where sampling starts, without any weight: such schedules have
+    min(SNR + 1, γ) at every step, which is v's even weight (Lin et al. 2023) under the same bound,
+    and what Salimans and Ho 2022 give few-step models for this reason.
     """
     alpha = schedule.alphas_cumprod.to(timestep.device, non_blocking=True)[timestep]
     snr = alpha / (1 - alpha)

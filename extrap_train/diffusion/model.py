@@ -27,7 +27,7 @@ class ExtrapolationModel(nn.Module):
     """Denoiser, image encoder, projection to the token, and the latent space they work in.
 
     Small or full size, of any family: the configuration chooses the parts, and nothing else
-    differs. A VAE and CLIP are frozen and no modules of it (`frozen.Frozen`).
+    differs. A VAE and CLIP are frozen and no modules of it (`encoders.Frozen`).
     """
 
     def __init__(self, config: ModelConfig) -> None:

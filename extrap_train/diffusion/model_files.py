@@ -44,9 +44,9 @@ def save_model(model: ExtrapolationModel, folder: Path, dtype: torch.dtype = tor
         write_record(temporary / MODEL_CONFIG, model.config)
         for part, network in model.parts().items():
             (temporary / part).mkdir()
-            state = network.state_dict()  # copied: a module that goes on training keeps its own
-            halved = {k: v.detach().to("cpu", dtype).contiguous() for k, v in state.items()}
-            write_tensors(halved, temporary / part / _FILES[part])
+            state = network.state_dict()
+            on_cpu = {k: v.detach().to("cpu", dtype).contiguous() for k, v in state.items()}
+            write_tensors(on_cpu, temporary / part / _FILES[part])
         model.unet.save_config(temporary / "unet")
         model.schedule.save_pretrained(temporary / "scheduler")
         if model.config.vae is not None:

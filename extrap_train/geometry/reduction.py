@@ -16,8 +16,8 @@ from extrap_train.views import PairBatch, Warp
 def reduce_batch(batch: PairBatch, factor: int) -> PairBatch:
     """The batch with everything in it, its warp too, at 1/`factor` of its size.
 
-    Colours are averaged; depth, which has edges, is taken from one pixel in each block, half a fine
-    pixel off the block's middle.
+    Colours are averaged; depth, which has edges, is taken from one pixel in each block: the middle
+    one, or half a fine pixel off the middle where `factor` is even.
     """
     if factor == 1:
         return batch

@@ -18,7 +18,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class Died:
-    """In place of a result: the job's process ended or had no memory left, and once more alone."""
+    """In place of the result of a job whose process died or ran out of memory, also on its own."""
 
     reason: str
 

@@ -44,9 +44,11 @@ def fit_world_frame(cameras: Camera) -> WorldFrame:
 def choose_frames(
     frames: Sequence[Frame], count: int | None, names: Sequence[str], draw: str, seed: int
 ) -> list[int]:
-    """Indices of the photographs to start from; InputError for names that there are not.
+    """Indices of the photographs to start from; InputError for names that there are not, or where
+    there are fewer than `count`.
 
-    `one_sided` walks along the orbit in steps near 25°, `spread` takes the farthest cameras.
+    `one_sided` walks along the orbit in steps near 25°, with no gap of 60° where that can be;
+    `spread` takes the farthest cameras.
     """
     if names:
         known = {frame.name: index for index, frame in enumerate(frames)}
@@ -57,7 +59,9 @@ def choose_frames(
                 f"{', '.join(list(known)[:4])} …"
             )
         return [known[name] for name in names]
-    if count is None or count >= len(frames):
+    if count is not None and count > len(frames):
+        raise InputError(f"inputs={count}: the scene has {len(frames)} frames; give fewer")
+    if count is None or count == len(frames):
         return list(range(len(frames)))
     cameras = stack_poses([frame.camera for frame in frames])
     start = int(np.random.default_rng(seed).integers(len(frames)))
@@ -65,16 +69,18 @@ def choose_frames(
         chosen = farthest_point_sample(camera_centers(cameras), count, start)
         return sorted(int(index) for index in chosen)
     azimuths, _, _ = fit_circle(cameras).locate(camera_centers(cameras))
+    walks: dict[float, list[int]] = {}
     for first in (start, *np.argsort(azimuths)):
         walk = [int(first)]
         while len(walk) < count:
             ahead = (azimuths - azimuths[walk[-1]]) % (2 * np.pi)
             ahead[walk] = np.inf
             walk.append(int(np.abs(ahead - ONE_SIDED_STEP_RAD).argmin()))
-        span = np.diff(azimuths[walk]) % (2 * np.pi)
-        if (span < np.pi / 3).all():
+        largest_gap = float((np.diff(azimuths[walk]) % (2 * np.pi)).max(initial=0.0))
+        if largest_gap < np.pi / 3:
             return walk
-    return walk
+        walks.setdefault(largest_gap, walk)
+    return walks[min(walks)]
 
 
 def check_cameras(cameras: Sequence[Camera], names: Sequence[str]) -> None:

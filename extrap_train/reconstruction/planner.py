@@ -38,8 +38,9 @@ def orbit_queries(cameras: Camera, step_rad: float) -> list[Query]:
     azimuths, elevations, distances = circle.locate(camera_centers(cameras))
     order = np.argsort(azimuths, kind="stable")
     queries = []
-    for one, other in zip(order, np.roll(order, -1), strict=True):
-        gap = (azimuths[other] - azimuths[one]) % (2 * np.pi) or 2 * np.pi
+    around = azimuths[order]
+    gaps = np.diff(around, append=around[0] + 2 * np.pi)
+    for one, other, gap in zip(order, np.roll(order, -1), gaps, strict=True):
         steps = max(1, round(gap / step_rad))
         shares = np.arange(1, steps) / steps
         gap_azimuths = azimuths[one] + shares * gap
@@ -73,8 +74,10 @@ def _cameras_at(world_to_cam: Float[np.ndarray, "n 4 4"], like: Camera) -> Camer
 
 
 def next_query(known: GlobalMap, queries: list[Query]) -> Query:
-    """The query that the map covers best, of those 20–40° from it; of equals, the one farthest
-    from the newest view, so that branches grow in turn. The nearest one where none is in range.
+    """The query that the map covers best, of those 20–40° from their nearest known view.
+
+    Of equals, the one farthest from the newest view, so that branches grow in turn. Where none is
+    in range, the nearest one.
     """
     cameras = stack_cameras([*(v.camera for v in known.views), *(q.camera for q in queries)])
     angles = pairwise_angles(cameras, scene_center(known.cameras))[len(known) :, : len(known)]
@@ -108,7 +111,9 @@ def expected_order(known: GlobalMap, queries: list[Query]) -> list[Query]:
 
 
 def coverage(known: GlobalMap, camera: Camera) -> float:
-    """Share of the camera's picture that its nearest views reach."""
+    """Share of the camera's picture that the nearest views reach, generated ones included: what a
+    new view can be aligned to.
+    """
     views = [known.views[i] for i in known.nearest(camera, ORBIT_REFERENCES)]
     small = [view.view.resized(PREVIEW_SIZE, PREVIEW_SIZE) for view in views]
     depths = torch.stack([view.depth for view in small if view.depth is not None])

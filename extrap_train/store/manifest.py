@@ -1,5 +1,5 @@
-"""What a result on disk was made from, and its folder: held by one process, and reused, made or
-refused by what it was made from.
+"""A result's manifest, which says what it was made from, and its folder, which one process holds
+while it decides whether to reuse, replace or refuse it.
 """
 
 import json
@@ -42,12 +42,6 @@ class Split:
             return []
         return sorted({*self.test} & {*seen.train})
 
-    def _change(self, before: "Split | None") -> str:
-        if before is None:
-            return "new"
-        moved = sorted({*before.test} & {*self.train} | {*before.train} & {*self.test})
-        return f"{len(moved)} captures changed sides: {moved[0]}" if moved else "other captures"
-
 
 @dataclass(frozen=True)
 class Manifest:
@@ -87,8 +81,8 @@ class Manifest:
             if before.inputs.get(name) != self.inputs.get(name)
         ]
         found += [
-            f"split of {category} ({split._change(before.split.get(category))})"
-            for category, split in self.split.items()
+            f"split of {category} ({_split_change(before.split.get(category), split)})"
+            for category, split in {**dict.fromkeys(before.split), **self.split}.items()
             if split != before.split.get(category)
         ]
         more = len(found) - _MOST_NAMED
@@ -101,6 +95,13 @@ class Manifest:
             for category in self.split.keys() & seen.split.keys()
         }
         return {category: names for category, names in sorted(found.items()) if names}
+
+
+def _split_change(before: Split | None, now: Split | None) -> str:
+    if before is None or now is None:
+        return "new" if before is None else "no longer there"
+    moved = sorted({*before.test} & {*now.train} | {*before.train} & {*now.test})
+    return f"{len(moved)} captures changed sides: {moved[0]}" if moved else "other captures"
 
 
 def _input_change(before: str | None, now: str | None) -> str:

@@ -87,6 +87,24 @@ def test_every_end_is_a_result_or_a_reason(tmp_path: Path, monkeypatch: pytest.M
     assert not _is_alive(int(orphan.stem))
 
 
+def count_guests(folder: str) -> bytes:
+    """How many run, this one included, when it begins; it takes longer than a look at them."""
+    own = Path(folder) / f"{os.getpid()}.running"
+    own.touch()
+    found = len([*own.parent.glob("*.running")])
+    time.sleep(1.3)
+    own.unlink()
+    return str(found).encode()
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_no_more_guests_run_than_workers(tmp_path: Path, workers: int) -> None:
+    launcher = GuestLauncher(workers, timeout_s=300.0)
+    found = [result for _, result in launcher.run(count_guests, [str(tmp_path)] * (workers + 1))]
+    assert len(found) == workers + 1
+    assert max(found) <= str(workers).encode()
+
+
 def test_what_hangs_is_ended(tmp_path: Path) -> None:
     result = _run(tmp_path, "hang", timeout_s=1.0)["hang"]
     assert isinstance(result, Died)

@@ -117,6 +117,13 @@ def completed(known: GlobalMap, generator=None, references="photographs", **conf
     return grown, steps
 
 
+def test_two_inputs_above_each_other_are_turned_around_once():
+    cameras = [scenes.orbit_camera(30.0, size=SIZE, elevation_deg=e) for e in (5.0, 35.0)]
+    queries = orbit_queries(stack_cameras(cameras), np.radians(30))
+    names = [query.name for query in queries]
+    assert len(names) == len({*names}) == 11
+
+
 def off_surface(known: GlobalMap, votes: bool = True) -> float:
     """Share of the measured points that lie more than 2 % of the sphere's size off any surface."""
     cloud = cloud_of(known, votes=votes)

@@ -6,14 +6,21 @@ import numpy as np
 import pytest
 import scenes
 import torch
+from in_process import run_command
 
+from extrap_train.__main__ import main
 from extrap_train.config import CompletionConfig, TrainerConfig
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError
 from extrap_train.geometry.visibility import Ball
 from extrap_train.reconstruction.completion import CompletionPipeline, add_view, map_of_inputs
 from extrap_train.reconstruction.depth_completion.calibration import calibrate
-from extrap_train.reconstruction.depth_completion.examples import draw_examples, with_truth
+from extrap_train.reconstruction.depth_completion.examples import (
+    LEAST_FRAMES,
+    _draw_frames,
+    draw_examples,
+    with_truth,
+)
 from extrap_train.reconstruction.depth_completion.inference import (
     CompletedDepth,
     NetworkCompletion,
@@ -262,3 +269,18 @@ def test_with_truth_weighs_nothing_where_the_truth_is_unknown():
     weight = with_truth(observed(query, front()), holed).weight[0]
     assert (weight[query.mask > 0.5] == 0).all()
     assert (weight[holed.depth > 0] > 0).all()
+
+
+@pytest.mark.parametrize("frames", [LEAST_FRAMES, LEAST_FRAMES + 1, 16])
+def test_every_draw_has_a_query_that_is_no_reference(frames):
+    for seed in range(200):
+        draw = _draw_frames(frames, np.random.default_rng(seed))
+        assert draw.query not in draw.references
+        assert {*draw.inputs} <= {*draw.references} <= {*range(frames)}
+
+
+def test_captures_of_too_few_photographs_are_refused(tmp_path):
+    few = f"data.frames={LEAST_FRAMES - 1}"
+    said = run_command(main, "task=depth", "category=cup", few, f"output={tmp_path}", status=1)
+    assert said.startswith(f"error: {few}")
+    assert not [*tmp_path.iterdir()]

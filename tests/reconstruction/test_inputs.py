@@ -152,6 +152,19 @@ def test_one_sided_inputs_are_neighbours_and_spread_ones_are_not():
     assert np.linalg.norm(center - [0.5, -0.2, 0.1]) < 1e-3
 
 
+def test_where_every_walk_has_a_gap_the_smallest_gap_is_taken():
+    cams = ring(np.array([0.0, 20.0, 150.0, 175.0, 260.0]))
+    found = [Frame(f"f{i}", cams[i], True, False, lambda depth: None, ()) for i in range(5)]
+    for seed in range(4):
+        assert choose_frames(found, 4, [], "one_sided", seed) in ([2, 3, 4, 0], [3, 2, 4, 0])
+
+
+def test_more_inputs_than_there_are_frames_are_refused():
+    assert choose_frames(frames(5), 5, [], "one_sided", 0) == [0, 1, 2, 3, 4]
+    with pytest.raises(InputError, match="inputs=6"):
+        choose_frames(frames(5), 6, [], "one_sided", 0)
+
+
 def test_names_of_inputs_are_taken_as_they_are_and_unknown_ones_refused():
     assert choose_frames(frames(5), 3, ["f4", "f1"], "one_sided", 0) == [4, 1]
     with pytest.raises(InputError, match="has no frame f9"):

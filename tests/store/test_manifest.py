@@ -42,7 +42,8 @@ def test_versions_are_recorded_and_not_compared() -> None:
             {"split": {"hydrant": replace(_SPLIT, train=("0001",), test=("0002",))}},
             ["hydrant", "2 captures", "0001"],
         ),
-        ({"split": {"apple": _SPLIT}}, ["apple"]),
+        ({"split": {**_MANIFEST.split, "apple": _SPLIT}}, ["apple", "new"]),
+        ({"split": {}}, ["hydrant"]),
     ],
 )
 def test_every_change_of_content_is_named(change: dict, named: list[str]) -> None:

@@ -68,7 +68,7 @@ def _pixels(network: DepthNetwork, batches: Iterable[Float[Tensor, "b c h w"]]) 
 
 
 def score_depth(network: DepthNetwork, batches: Iterable[Float[Tensor, "b c h w"]]) -> DepthScores:
-    """Scores over stored examples, as `training.StoredExamples.captures` gives them."""
+    """Scores over stored examples, as `network_training.StoredExamples.captures` gives them."""
     return _pixels(network, batches).scores()
 
 

@@ -15,6 +15,8 @@ from extrap_train.geometry.visibility import Ball
 from extrap_train.reconstruction.depth_completion.observation import Observation, observe
 from extrap_train.views import View, combine, stack_cameras
 
+LEAST_FRAMES = 7
+"""Of a capture: five inputs, what may have grown on both sides of them, and a query."""
 MOST_REFERENCES = 6
 LARGEST_ERROR = 0.03
 """Of generated references' depth, relative, one standard deviation."""
