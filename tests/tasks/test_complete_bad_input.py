@@ -158,8 +158,8 @@ def test_the_unit_of_the_world_does_not_matter(
     content = _capture(tmp_path / "scene", pictures, scale)
     (tmp_path / "scene" / "transforms.json").write_text(json.dumps(content))
     options = ["task=complete", "category=book", f"scene={tmp_path / 'scene'}", "weights=base"]
-    options += ["depth=stereo", "depth.image_size=96", "inputs=4", "complete.dry_run=true"]
-    options += [f"output={tmp_path}"]
+    options += ["depth=stereo", "depth.image_size=96", "depth.planes=16", "inputs=4"]
+    options += ["complete.dry_run=true", f"output={tmp_path}"]
     monkeypatch.setattr(sys, "argv", ["extrap_train", *options])
     main()
     assert "nothing was generated" in capsys.readouterr().out

@@ -12,15 +12,13 @@ from filelock import FileLock
 from extrap_train.diffusion.model_files import load_model, save_model
 from extrap_train.tasks import scene
 
-_SHORT = ["minutes=0.2", "lora.steps=1", "lora.validate_every=1", "sampler.steps=1"]
-
 
 def _rank(folder: Path) -> int:
     return json.loads((folder / "adapter" / "adapter_config.json").read_text())["r"]
 
 
 def test_an_interrupted_adaptation_leaves_what_was_there(
-    command, weights, tmp_path, capsys, monkeypatch
+    command, weights, brief, tmp_path, capsys, monkeypatch
 ) -> None:
     """Though it was at its very end."""
 
@@ -28,21 +26,23 @@ def test_an_interrupted_adaptation_leaves_what_was_there(
         raise KeyboardInterrupt
 
     folder = tmp_path / "scene" / "hydrant-0000"
-    command("task=scene", f"weights={weights}", *_SHORT, "lora.rank=3")
+    command("task=scene", f"weights={weights}", *brief, "lora.rank=3")
     with monkeypatch.context() as patch:
         patch.setattr(scene, "_write", stopped)
         with pytest.raises(SystemExit) as ended:
-            command("task=scene", f"weights={weights}", *_SHORT, "lora.rank=2", "resume=false")
+            command("task=scene", f"weights={weights}", *brief, "lora.rank=2", "resume=false")
     assert str(ended.value).startswith("interrupted: nothing was changed")
     assert _rank(folder) == 3
     capsys.readouterr()
-    command("task=scene", f"weights={weights}", *_SHORT, "lora.rank=3")
+    command("task=scene", f"weights={weights}", *brief, "lora.rank=3")
     assert "already adapted with these options" in capsys.readouterr().out
     assert not list(folder.parent.glob(".*.tmp"))
 
 
-def test_other_options_do_not_overwrite_an_adapter(command, refused, weights, tmp_path) -> None:
-    base = ["task=scene", f"weights={weights}", *_SHORT, "lora.rank=3"]
+def test_other_options_do_not_overwrite_an_adapter(
+    command, refused, weights, brief, tmp_path
+) -> None:
+    base = ["task=scene", f"weights={weights}", *brief, "lora.rank=3"]
     command(*base)
     said = refused(*base, "lora.rank=2", "inputs=3")
     assert "scene/hydrant-0000: made with different " in said
@@ -91,8 +91,10 @@ def test_another_pose_replaces_a_view_but_other_weights_do_not(
     command("task=view", f"weights={copy}", "pose=frame000005", "resume=false")
 
 
-def test_a_folder_that_says_not_what_it_is_of_is_left_alone(refused, weights, tmp_path) -> None:
-    for task in (["task=view", "pose=frame000003"], ["task=scene", *_SHORT], ["task=complete"]):
+def test_a_folder_that_says_not_what_it_is_of_is_left_alone(
+    refused, weights, brief, tmp_path
+) -> None:
+    for task in (["task=view", "pose=frame000003"], ["task=scene", *brief], ["task=complete"]):
         mine = tmp_path / task[0].removeprefix("task=") / "mine"
         mine.mkdir(parents=True)
         (mine / "thesis.txt").write_text("years of work")
@@ -114,7 +116,7 @@ def test_a_link_to_a_folder_elsewhere_takes_the_result_there(command, weights, t
         assert (elsewhere / "views" / f"{pose}.png").is_file()
 
 
-@pytest.mark.parametrize("task", [["task=scene", *_SHORT], ["task=view", "pose=frame000003"]])
+@pytest.mark.parametrize("task", [["task=scene"], ["task=view", "pose=frame000003"]])
 def test_two_at_once_do_not_write_the_same_folder(refused, weights, tmp_path, task) -> None:
     lock = tmp_path / task[0].removeprefix("task=") / ".hydrant-0000.lock"
     lock.parent.mkdir()

@@ -167,6 +167,7 @@ def test_an_adapter_is_made_used_again_and_put_upon_the_weights(
     assert set(summary["held_out"]) == {"model", "adapted"}
     assert math.isfinite(summary["held_out"]["adapted"]["psnr"])
     assert (folder / "held_out.png").is_file()
+    assert (folder / "curve.png").is_file()
     capsys.readouterr()
     command("task=scene", f"weights={weights}", *options)
     assert "already adapted with these options" in capsys.readouterr().out
@@ -184,16 +185,13 @@ def test_an_adapter_is_made_used_again_and_put_upon_the_weights(
     assert "PSNR against the photograph" in said.out
 
 
-@pytest.mark.usefixtures("measured_once")
 def test_a_damaged_adapter_is_made_again_and_one_of_other_weights_is_kept(
-    command, refused, weights, tmp_path, capsys
+    command, refused, weights, brief, tmp_path, capsys
 ) -> None:
     """Weights of the same name that were trained for longer are other weights."""
     folder, model = tmp_path / "scene" / "hydrant-0000", tmp_path / "model"
     shutil.copytree(weights, model)
-    options = ["minutes=0.2", "lora.steps=1", "lora.validate_every=1", "sampler.steps=1"]
-    options += ["lora.batch_size=1", "lora.virtual_references=2"]
-    asked = ["task=scene", f"weights={model}", *options]
+    asked = ["task=scene", f"weights={model}", *brief]
 
     def is_made() -> bool:
         capsys.readouterr()
