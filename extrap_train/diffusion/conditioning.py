@@ -97,7 +97,8 @@ def concatenated_latents(
     reference = autoencoder.encode_reference(batch.reference_images[:, 0])
     warped = autoencoder.encode(filled_warp(warp))
     height, width = reference.shape[-2:]
-    grid = coordinate_grid(height, width).to(reference).expand(len(reference), -1, -1, -1)
+    grid = coordinate_grid(height, width).to(reference, non_blocking=True)
+    grid = grid.expand(len(reference), -1, -1, -1)
     channels = [
         reference,
         warped,

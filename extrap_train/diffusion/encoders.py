@@ -221,7 +221,9 @@ def clip_input(image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 224 224"]:
     """
     size = (_CLIP_SIZE, _CLIP_SIZE)
     resized = functional.interpolate(image, size, mode="bicubic", align_corners=True)
-    mean, std = (image.new_tensor(x)[:, None, None] for x in (_CLIP_MEAN, _CLIP_STD))
+    mean, std = (
+        torch.tensor(x).to(image, non_blocking=True)[:, None, None] for x in (_CLIP_MEAN, _CLIP_STD)
+    )
     return (resized - mean) / std
 
 

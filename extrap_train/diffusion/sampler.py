@@ -89,7 +89,7 @@ def sample_views(
 
     def draw_noise() -> Float[Tensor, "b z h w"]:
         drawn = torch.stack([torch.randn(shape, generator=g) for g in generators])
-        return drawn.to(conditioning.base)
+        return drawn.to(conditioning.base, non_blocking=True)
 
     if config.solver == "ddim":
         timesteps = ddim_timesteps(model.schedule, config)

@@ -25,8 +25,8 @@ def lanczos_resize(
 
     Pillow's `LANCZOS` without its rounding to 8 bits; values may over- and undershoot.
     """
-    rows = _weights(image.shape[-2], height).to(image)
-    columns = _weights(image.shape[-1], width).to(image)
+    rows = _weights(image.shape[-2], height).to(image, non_blocking=True)
+    columns = _weights(image.shape[-1], width).to(image, non_blocking=True)
     return rows @ image @ columns.mT
 
 

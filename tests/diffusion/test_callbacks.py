@@ -17,6 +17,7 @@ from lightning.pytorch.accelerators import CPUAccelerator
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.strategies import SingleDeviceStrategy
 from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from extrap_train.config import ModelConfig, TrainConfig
 from extrap_train.diffusion import callbacks
@@ -24,6 +25,7 @@ from extrap_train.diffusion.callbacks import AveragedWeights, MetricsTable, Step
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.errors import InputError
+from extrap_train.views import PairBatch
 
 
 def test_rows_of_one_step_are_one_row_and_new_columns_are_added(tmp_path: Path) -> None:
@@ -135,8 +137,23 @@ def test_the_average_is_kept_where_the_model_is_trained() -> None:
     assert int(made.n_averaged) == 3
 
 
+class _NoWaitingCopies(TorchDispatchMode):
+    """Refuses copies to another device that hold up this process until they have arrived."""
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        leaves = kwargs.get("device") is not None and torch.device(kwargs["device"]).type == "meta"
+        if func is torch.ops.aten._to_copy.default and leaves and args[0].device.type == "cpu":
+            assert kwargs.get("non_blocking"), f"{tuple(args[0].shape)} is waited for"
+        return func(*args, **kwargs)
+
+
 class _Training(CategoryTraining):
     """With an optimiser that any device has."""
+
+    def training_step(self, batch: PairBatch, batch_idx: int) -> Tensor:
+        with _NoWaitingCopies():
+            return super().training_step(batch, batch_idx)
 
     def configure_optimizers(self):
         return torch.optim.SGD(self.parameters(), lr=0.1)
@@ -146,7 +163,7 @@ class _Training(CategoryTraining):
 def test_a_step_waits_for_no_number(
     monkeypatch: pytest.MonkeyPatch, config: ModelConfig, family: str
 ) -> None:
-    """Neither the loss, nor the average, nor the bar between two of its pictures."""
+    """Nor for what it brings to the device. The bar is not drawn meanwhile."""
     monkeypatch.setattr(callbacks, "DRAWN_EVERY_S", math.inf)
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # knows no `meta`
     model = ExtrapolationModel(replace(config, family=family))
