@@ -31,6 +31,14 @@ def combine(parts: Sequence[T], join: Callable[[Sequence[Tensor]], Tensor]) -> T
     return cast(T, replace(first, **joined))
 
 
+def send(tensor: Tensor, target: torch.device | str | Tensor) -> Tensor:
+    """`tensor.to(target)`, without waiting for a GPU to have it."""
+    device = target.device if isinstance(target, Tensor) else torch.device(target)
+    move = cast(Any, tensor.to)
+    # An `mps` may read memory after it has been given back: pytorch/pytorch#83015.
+    return cast(Tensor, move(target, non_blocking=device.type not in ("cpu", "mps")))
+
+
 @dataclass(frozen=True)
 class Camera:
     """One pinhole camera, or a batch of them that share an image size."""
@@ -239,7 +247,7 @@ class PackedBatch:
 
     def to(self, device: torch.device | str) -> "PackedBatch":
         """The same batch on another device, which pinned memory reaches while others compute."""
-        return combine([self], lambda tensors: tensors[0].to(device, non_blocking=True))
+        return combine([self], lambda tensors: send(tensors[0], device))
 
     def pin_memory(self) -> "PackedBatch":
         """The same batch in memory that a GPU copies from by itself; a DataLoader asks for it."""

@@ -16,7 +16,7 @@ from torch.nn import functional
 from extrap_train.diffusion.encoders import Autoencoder
 from extrap_train.geometry.encoding import coordinate_grid, positional_encoding
 from extrap_train.geometry.fill import fill_holes
-from extrap_train.views import PairBatch, Warp, combine
+from extrap_train.views import PairBatch, Warp, combine, send
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def concatenated_latents(
     reference = autoencoder.encode_reference(batch.reference_images[:, 0])
     warped = autoencoder.encode(filled_warp(warp))
     height, width = reference.shape[-2:]
-    grid = coordinate_grid(height, width).to(reference, non_blocking=True)
+    grid = send(coordinate_grid(height, width), reference)
     grid = grid.expand(len(reference), -1, -1, -1)
     channels = [
         reference,

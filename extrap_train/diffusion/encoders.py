@@ -15,6 +15,7 @@ from torch.nn import functional
 from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
 from extrap_train.config import ClipConfig, ModelConfig, VaeConfig
+from extrap_train.views import send
 
 LATENT_SCALE = 0.18215
 """Brings Stable Diffusion's latents to about unit spread."""
@@ -130,7 +131,7 @@ class KlAutoencoder(Frozen):
         posterior = self._posterior(image)
         latent = posterior.mean.float()
         if generator is not None:
-            noise = torch.randn(latent.shape, generator=generator).to(latent, non_blocking=True)
+            noise = send(torch.randn(latent.shape, generator=generator), latent)
             latent = latent + posterior.std.float() * noise
         return latent * LATENT_SCALE
 
@@ -221,9 +222,7 @@ def clip_input(image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 224 224"]:
     """
     size = (_CLIP_SIZE, _CLIP_SIZE)
     resized = functional.interpolate(image, size, mode="bicubic", align_corners=True)
-    mean, std = (
-        torch.tensor(x).to(image, non_blocking=True)[:, None, None] for x in (_CLIP_MEAN, _CLIP_STD)
-    )
+    mean, std = (send(torch.tensor(x), image)[:, None, None] for x in (_CLIP_MEAN, _CLIP_STD))
     return (resized - mean) / std
 
 

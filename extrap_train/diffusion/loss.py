@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from extrap_train.diffusion.conditioning import Conditioning
 from extrap_train.diffusion.model import ExtrapolationModel
-from extrap_train.views import PairBatch
+from extrap_train.views import PairBatch, send
 
 Unchanged = Callable[[], AbstractContextManager[None]]
 """In its context a model that is adapted is as it was before."""
@@ -45,11 +45,10 @@ def diffusion_loss(
     target = model.encode_target(batch.image, conditioning, generator)
     dropped = torch.rand(len(target), generator=generator) < condition_dropout
     steps = model.schedule.config["num_train_timesteps"]
-    timestep = torch.randint(0, steps, (len(target),), generator=generator).to(
-        target.device, non_blocking=True
-    )
-    noise = torch.randn(target.shape, generator=generator).to(target, non_blocking=True)
-    conditioning = conditioning.zeroed(dropped.to(target.device, non_blocking=True))
+    timestep = torch.randint(0, steps, (len(target),), generator=generator)
+    timestep = send(timestep, target.device)
+    noise = send(torch.randn(target.shape, generator=generator), target)
+    conditioning = conditioning.zeroed(send(dropped, target.device))
     errors = prediction_errors(model, target, noise, timestep, conditioning, anchor)
     if min_snr is not None:
         errors = errors * snr_weights(model.schedule, timestep, min_snr)
@@ -69,7 +68,7 @@ def prediction_errors(
     With an anchor, against the truth where it is known and the unchanged model's prediction
     elsewhere, mixed by area where a latent is both.
     """
-    alpha = model.schedule.alphas_cumprod.to(target, non_blocking=True)[timestep, None, None, None]
+    alpha = send(model.schedule.alphas_cumprod, target)[timestep, None, None, None]
     signal, spread = alpha**0.5, (1 - alpha) ** 0.5
     noisy = signal * target + spread * noise  # equation 4 of Ho et al. 2020
     prediction = model(noisy, timestep, conditioning)
@@ -96,7 +95,7 @@ def snr_weights(
     min(SNR + 1, γ) at every step, which is v's even weight (Lin et al. 2023) under the same bound,
     and what Salimans and Ho 2022 give few-step models for this reason.
     """
-    alpha = schedule.alphas_cumprod.to(timestep.device, non_blocking=True)[timestep]
+    alpha = send(schedule.alphas_cumprod, timestep.device)[timestep]
     snr = alpha / (1 - alpha)
     weight = snr + 1 if schedule.config["rescale_betas_zero_snr"] else snr
     per_unit = {"epsilon": snr, "sample": torch.ones_like(snr), "v_prediction": snr + 1}

@@ -14,7 +14,7 @@ from torch import Tensor
 from extrap_train.config import SamplerConfig, require_published
 from extrap_train.diffusion.conditioning import Conditioning
 from extrap_train.errors import InputError
-from extrap_train.views import PairBatch
+from extrap_train.views import PairBatch, send
 
 Denoise = Callable[[Float[Tensor, "b z h w"], int], Float[Tensor, "b z h w"]]
 """From a noisy latent and its timestep to the prediction that the schedule names."""
@@ -89,7 +89,7 @@ def sample_views(
 
     def draw_noise() -> Float[Tensor, "b z h w"]:
         drawn = torch.stack([torch.randn(shape, generator=g) for g in generators])
-        return drawn.to(conditioning.base, non_blocking=True)
+        return send(drawn, conditioning.base)
 
     if config.solver == "ddim":
         timesteps = ddim_timesteps(model.schedule, config)

@@ -5,6 +5,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
+from extrap_train.views import send
+
 _LOBES = 3
 
 
@@ -25,8 +27,8 @@ def lanczos_resize(
 
     Pillow's `LANCZOS` without its rounding to 8 bits; values may over- and undershoot.
     """
-    rows = _weights(image.shape[-2], height).to(image, non_blocking=True)
-    columns = _weights(image.shape[-1], width).to(image, non_blocking=True)
+    rows = send(_weights(image.shape[-2], height), image)
+    columns = send(_weights(image.shape[-1], width), image)
     return rows @ image @ columns.mT
 
 
