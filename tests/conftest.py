@@ -5,17 +5,15 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
+from typing import Any
 
 # One thread per worker, and per command that a test starts: the workers share the cores.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import numba
 import pytest
-import torch
-from hydra._internal.hydra import Hydra
-from hydra.types import RunMode
-from shape_checks import check_shapes, forget_checks
+from shape_hook import check_shapes
 
+# Heavy imports stand in what needs them: the process that hands the tests out does without.
 check_shapes()
 
 _FORKED = (
@@ -47,7 +45,11 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Tests that compare with a GPU are skipped where torch finds none."""
-    if item.get_closest_marker("gpu") and not torch.cuda.is_available():
+    if not item.get_closest_marker("gpu"):
+        return
+    import torch
+
+    if not torch.cuda.is_available():
         pytest.skip(f"needs a CUDA device; torch {torch.__version__} finds none")
 
 
@@ -75,28 +77,35 @@ def _fork_server_of_a_worker(request: pytest.FixtureRequest) -> None:
         request.getfixturevalue("fork_server")
 
 
-def _compose_once() -> None:
+@pytest.fixture(scope="session", autouse=True)
+def _compose_once() -> Iterator[None]:
     """Hydra composes a command's options a first time to look for a sweep in them: only a word or
     a flag asks for one here.
     """
+    from hydra._internal.hydra import Hydra
+
     get_mode = Hydra.get_mode
 
-    def mode(self: Hydra, config_name: str | None, overrides: list[str]) -> RunMode | None:
+    def mode(self: Hydra, config_name: str | None, overrides: list[str]) -> Any:
         asked = any(word.startswith("hydra.mode=") for word in overrides)
         return get_mode(self, config_name, overrides) if asked else None
 
-    Hydra.get_mode = mode
-
-
-_compose_once()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Hydra, "get_mode", mode)
+        yield
 
 
 def _use_one_thread() -> None:
+    import numba
+    import torch
+
     torch.set_num_threads(1)
     numba.set_num_threads(1)
 
 
-_use_one_thread()  # before fixtures of whole modules
+@pytest.fixture(scope="session", autouse=True)
+def _one_thread_for_shared_fixtures() -> None:
+    _use_one_thread()
 
 
 @pytest.fixture(autouse=True)
@@ -107,7 +116,18 @@ def _one_thread() -> None:
 
 @pytest.fixture(autouse=True)
 def _shapes_are_checked_in_every_test() -> None:
+    from shape_checks import forget_checks
+
     forget_checks()
+
+
+@pytest.fixture(scope="module")
+def rendered_once() -> Iterator[None]:
+    """Scenes named `synthetic:` and a table's synthetic captures are rendered once per session."""
+    from rendered_once import rendered_once
+
+    with rendered_once():
+        yield
 
 
 @pytest.fixture

@@ -6,12 +6,9 @@ fit calls the same functions a thousand times.
 """
 
 import inspect
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import is_dataclass
 from functools import wraps
-from importlib.abc import MetaPathFinder
-from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from types import ModuleType
 from typing import Any
 
@@ -20,15 +17,8 @@ from beartype import beartype
 from jaxtyping import jaxtyped
 from torch import Tensor
 
-_PACKAGES = {"extrap_train", "data_prep", "benchmarks"}
 _SEEN: set[tuple[Any, ...]] = set()
 """Functions with the types and shapes of arguments that they have passed with."""
-
-
-def check_shapes() -> None:
-    """Check every module of ours that is imported from now on."""
-    assert not _PACKAGES & set(sys.modules), "imported before their shapes could be checked"
-    sys.meta_path.insert(0, _Finder())
 
 
 def forget_checks() -> None:
@@ -36,29 +26,16 @@ def forget_checks() -> None:
     _SEEN.clear()
 
 
-class _Finder(MetaPathFinder):
-    def find_spec(
-        self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
-    ) -> ModuleSpec | None:
-        if name.split(".")[0] not in _PACKAGES:
-            return None
-        spec = PathFinder.find_spec(name, path, target)
-        if spec is not None and type(spec.loader) is SourceFileLoader:
-            spec.loader = _Loader(spec.loader.name, spec.loader.path)
-        return spec
-
-
-class _Loader(SourceFileLoader):
-    def exec_module(self, module: ModuleType) -> None:
-        super().exec_module(module)
-        for name, member in list(vars(module).items()):
-            if getattr(member, "__module__", None) != module.__name__ or name.startswith("_"):
-                continue
-            if inspect.isfunction(member):
-                if _has_shapes(member):
-                    setattr(module, name, _checked(member))
-            elif inspect.isclass(member):
-                _check_class(member)
+def check_module(module: ModuleType) -> None:
+    """Replace its public functions and methods by ones that check what they are called with."""
+    for name, member in list(vars(module).items()):
+        if getattr(member, "__module__", None) != module.__name__ or name.startswith("_"):
+            continue
+        if inspect.isfunction(member):
+            if _has_shapes(member):
+                setattr(module, name, _checked(member))
+        elif inspect.isclass(member):
+            _check_class(member)
 
 
 def _check_class(cls: Any) -> None:

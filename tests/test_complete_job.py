@@ -47,6 +47,11 @@ def _finish(output: Path, *more: str, status: int = 0) -> str:
     return run_command(main, *_TINY, f"output={output}", *more, status=status)
 
 
+@pytest.fixture(autouse=True, scope="module")
+def _rendered_once(rendered_once: None) -> None:
+    """See `rendered_once`."""
+
+
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     output = tmp_path_factory.mktemp("undisturbed")

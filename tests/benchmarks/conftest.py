@@ -1,20 +1,17 @@
 """A small finished table that tests read, or damage a copy of."""
 
 import shutil
-from collections.abc import Iterator
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
 
 import pytest
-from rendered_once import rendered_once
 
 from tests.benchmarks.tables import run_greys, write_own
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _rendered_once() -> Iterator[None]:
-    with rendered_once():
-        yield
+def _rendered_once(rendered_once: None) -> None:
+    """See `rendered_once`."""
 
 
 @pytest.fixture(scope="session")

@@ -1,12 +1,11 @@
 """One scene on the command line: a tiny model, and the commands that work on the scene with it."""
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
-from rendered_once import rendered_once
 
 from extrap_train.__main__ import main
 from extrap_train.config import ModelConfig, UNetConfig
@@ -22,9 +21,8 @@ Refused = Callable[..., str]
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _rendered_once() -> Iterator[None]:
-    with rendered_once():
-        yield
+def _rendered_once(rendered_once: None) -> None:
+    """See `rendered_once`."""
 
 
 @pytest.fixture(scope="session")
