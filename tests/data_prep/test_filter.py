@@ -75,6 +75,9 @@ def test_stated_qualities_count_and_missing_ones_do_not() -> None:
     assert judge(capture(camera, viewpoint_quality=0.5, point_cloud_quality=1.0), OPTIONS).kept
     poor = judge(capture(camera, viewpoint_quality=-0.5, point_cloud_quality=-3.0), OPTIONS)
     assert poor.reason == "viewpoint quality -0.50 < 0; point cloud quality -3.00 < -2"
+    limits = {"viewpoint_quality": OPTIONS.min_viewpoint_quality}
+    limits |= {"point_cloud_quality": OPTIONS.min_point_cloud_quality}
+    assert judge(capture(camera, **limits), OPTIONS).kept
     unstated = capture(camera, viewpoint_quality=float("nan"), point_cloud_quality=float("nan"))
     assert judge(unstated, OPTIONS).kept
 

@@ -13,6 +13,7 @@ from extrap_train.geometry.viewpoints import (
     farthest_point_sample,
     fit_orbit,
     pairwise_angles,
+    references_by_nearness,
     scene_center,
 )
 from extrap_train.views import Camera
@@ -115,3 +116,10 @@ def test_farthest_points_of_a_line() -> None:
     assert farthest_point_sample(np.zeros((3, 2)), 3).tolist() == [0, 1, 2]
     with pytest.raises(ValueError, match="cannot choose 6 of 5"):
         farthest_point_sample(positions, 6)
+
+
+def test_the_nearest_view_of_a_camera_is_itself_however_its_directions_are_rounded() -> None:
+    """The cosine of a direction with itself may come out above 1, which no angle has."""
+    cameras = ring(np.random.default_rng(0).uniform(0, 360, 300))
+    order = references_by_nearness(cameras, cameras)
+    assert np.array_equal(order[:, 0], np.arange(300))
