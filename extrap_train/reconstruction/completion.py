@@ -14,12 +14,10 @@ from extrap_train.geometry.cameras import unproject
 from extrap_train.reconstruction.depth_completion.inference import DepthCompletion
 from extrap_train.reconstruction.global_map import GENERATED, GIVEN, GlobalMap, MapView, Origin
 from extrap_train.reconstruction.new_view import Proposal, propose, propose_completed
-from extrap_train.reconstruction.planner import Query, next_query
+from extrap_train.reconstruction.planner import REFERENCES, Query, next_query
 from extrap_train.reconstruction.prior import prior_of
 from extrap_train.views import Camera, View, stack_cameras
 
-REFERENCES = 3
-"""Views that a picture is warped from (paper II-A)."""
 LEAST_OVERLAP = 50
 """Pixels that two branches must share to be compared."""
 

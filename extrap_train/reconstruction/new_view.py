@@ -2,7 +2,6 @@
 where nothing measures it.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -193,12 +192,3 @@ def _seen_through(
         surer = other.confidence.flatten()[said.pixel] > confidence.flatten() + AS_SURE
         found |= (said.sight == Sight.IN_FRONT) & surer
     return found.view_as(depth) & (depth > 0)
-
-
-def scene_size(cameras: Camera, center: Float[Tensor, "3"]) -> float:
-    """Width of the pictures at the scene's centre, in scene units: the unit of drift."""
-    z = cameras.world_to_cam[:, 2, :3] @ center + cameras.world_to_cam[:, 2, 3]
-    width = z * cameras.width / cameras.intrinsics[:, 0, 0]
-    size = float(width.median())
-    assert math.isfinite(size)
-    return size

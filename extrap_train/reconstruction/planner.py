@@ -18,7 +18,8 @@ PREVIEW_SIZE = 32
 """Pixels of the warps that coverage is measured on."""
 SAME_COVERAGE = 0.1
 """Shares of the picture that differ by less are as good."""
-ORBIT_REFERENCES = 3
+REFERENCES = 3
+"""Views that a picture is warped from (paper II-A)."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,7 @@ def coverage(known: GlobalMap, camera: Camera) -> float:
     """Share of the camera's picture that the nearest views reach, generated ones included: what a
     new view can be aligned to.
     """
-    views = [known.views[i] for i in known.nearest(camera, ORBIT_REFERENCES)]
+    views = [known.views[i] for i in known.nearest(camera, REFERENCES)]
     small = [view.view.resized(PREVIEW_SIZE, PREVIEW_SIZE) for view in views]
     depths = torch.stack([view.depth for view in small if view.depth is not None])
     warp = warp_references(

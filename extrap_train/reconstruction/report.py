@@ -1,11 +1,14 @@
 """Numbers about a completed map: drift, consistency between views, coverage, 3-D scores."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from extrap_train.data.synthetic import SyntheticScene, surface_points
 from extrap_train.geometry.viewpoints import directions_from, scene_center
@@ -20,8 +23,8 @@ from extrap_train.reconstruction.cloud_metrics import (
 )
 from extrap_train.reconstruction.completion import Step
 from extrap_train.reconstruction.global_map import GENERATED, GlobalMap
-from extrap_train.reconstruction.new_view import scene_size
 from extrap_train.reconstruction.prior import prior_of
+from extrap_train.views import Camera
 
 TRUTH_POINTS = 60_000
 SEEN_WITHIN_RAD = np.radians(20)
@@ -86,3 +89,12 @@ def coverage_of(known: GlobalMap) -> dict[str, float]:
 def step_records(steps: Sequence[Step]) -> list[dict[str, Any]]:
     """The steps as JSON holds them."""
     return [asdict(step) for step in steps]
+
+
+def scene_size(cameras: Camera, center: Float[Tensor, "3"]) -> float:
+    """Width of the pictures at the scene's centre, in scene units: the unit of drift."""
+    z = cameras.world_to_cam[:, 2, :3] @ center + cameras.world_to_cam[:, 2, 3]
+    width = z * cameras.width / cameras.intrinsics[:, 0, 0]
+    size = float(width.median())
+    assert math.isfinite(size)
+    return size

@@ -21,10 +21,11 @@ from extrap_train.metrics import lpips_or_reason, psnr, quantised, ssim
 from extrap_train.pictures import colour_depth, contact_sheet, error_map, mark_holes
 from extrap_train.reconstruction.cloud import PointCloud, cloud_of
 from extrap_train.reconstruction.cloud_pictures import draw_growth, draw_turntable
-from extrap_train.reconstruction.completion import REFERENCES, CompletionPipeline, Step
+from extrap_train.reconstruction.completion import CompletionPipeline, Step
 from extrap_train.reconstruction.export import write_cloud, write_colmap, write_views
 from extrap_train.reconstruction.global_map import GENERATED, GIVEN, GlobalMap, MapView
 from extrap_train.reconstruction.inputs import stand_where
+from extrap_train.reconstruction.planner import REFERENCES
 from extrap_train.reconstruction.prior import prior_of
 from extrap_train.reconstruction.report import (
     cloud_scores,
