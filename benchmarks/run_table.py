@@ -46,7 +46,7 @@ from benchmarks.score.scoring import missing_networks
 from extrap_train.config import MethodConfig, TableConfig
 from extrap_train.errors import InputError
 from extrap_train.jobs import Died, Launcher
-from extrap_train.jobs.guests import AsGuest, GuestLauncher
+from extrap_train.jobs.isolated import Isolated, IsolatedLauncher
 from extrap_train.jobs.local import LocalLauncher
 from extrap_train.jobs.slurm import slurm_launcher
 from extrap_train.store.atomic import file_lock, remove_leftovers
@@ -113,8 +113,8 @@ def _run(
         raise InputError("the table has no methods: give methods=[...]")
     protocol, captures = open_protocol(table, folder, configs)
     draws = selected_draws(table, protocol, options.quick)
-    guests = _guests(configs, table, options)
-    contents = method_contents(configs, {draw.category for draw in draws}, guests)
+    isolated = _isolated_launcher(configs, table, options)
+    contents = method_contents(configs, {draw.category for draw in draws}, isolated)
     depth = catalogue.depth(table.rules.depth)
     scenes: list[Scene] = []
     with progress("preparing", len(draws), "draws") as bar:
@@ -137,7 +137,7 @@ def _run(
         cells=[job.folder.name for job in jobs],
     )
     try:
-        with _launchers(guests, options, table, jobs, folder) as (making, scoring):
+        with _launchers(isolated, options, table, jobs, folder) as (making, scoring):
             made = _make(left.to_make, making, folder)
             images = [
                 replace(job, images_from=job.folder)
@@ -207,19 +207,19 @@ def _report(
     return sum(cell.status == FAILED for cell in results.cells)
 
 
-def _guests(
+def _isolated_launcher(
     configs: Sequence[MethodConfig], table: TableConfig, options: RunOptions
-) -> GuestLauncher:
+) -> IsolatedLauncher:
     """What runs the methods' code, each time in a process of its own."""
     ours = {config.factory.rpartition(".")[0] for config in configs if is_ours(config)}
     preload = ("benchmarks.run.run_method", *sorted(ours))
     cores = 1 if device_of(table) == "cuda" else len(os.sched_getaffinity(0))
-    return GuestLauncher(options.workers or cores, table.cell_timeout_s, preload)
+    return IsolatedLauncher(options.workers or cores, table.cell_timeout_s, preload)
 
 
 @contextmanager
 def _launchers(
-    guests: GuestLauncher,
+    isolated: IsolatedLauncher,
     options: RunOptions,
     table: TableConfig,
     jobs: Sequence[CellJob],
@@ -228,12 +228,12 @@ def _launchers(
     """What makes images, each cell's in a process of its own, and what scores them."""
     if options.launcher is not None or options.slurm:
         elsewhere = options.launcher or slurm_launcher(table.slurm, folder.path / "slurm")
-        as_guest = AsGuest(run_method, guests.timeout_s, guests.preload)
-        yield partial(elsewhere.run, as_guest), elsewhere
+        alone = Isolated(run_method, isolated.timeout_s, isolated.preload)
+        yield partial(elsewhere.run, alone), elsewhere
         return
     # A further process loads for as long as it takes to score some cells here.
-    with LocalLauncher(min(guests.workers, 1 + len(jobs) // _CELLS_PER_SCORER)) as local:
-        yield partial(guests.run, run_method), local
+    with LocalLauncher(min(isolated.workers, 1 + len(jobs) // _CELLS_PER_SCORER)) as local:
+        yield partial(isolated.run, run_method), local
 
 
 def print_plan(

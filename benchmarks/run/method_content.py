@@ -17,7 +17,7 @@ from benchmarks.run.run_method import build_method, weight_paths
 from extrap_train.config import MethodConfig
 from extrap_train.errors import InputError
 from extrap_train.jobs import Died
-from extrap_train.jobs.guests import GuestLauncher
+from extrap_train.jobs.isolated import IsolatedLauncher
 from extrap_train.store.digests import file_digest
 
 MISSING_WEIGHTS = "missing: "
@@ -48,7 +48,7 @@ _ANSWERS = TypeAdapter(_Answer)
 
 
 def method_contents(
-    configs: Sequence[MethodConfig], categories: Iterable[str], guests: GuestLauncher
+    configs: Sequence[MethodConfig], categories: Iterable[str], isolated: IsolatedLauncher
 ) -> dict[str, MethodContent]:
     """By name, the content of each method for some categories; InputError for options or a factory
     that do not fit. A method whose own code fails here fails again when its images are made.
@@ -57,7 +57,7 @@ def method_contents(
     asked = [(config, wanted) for config in configs if not is_ours(config)]
     ours = [config for config in configs if is_ours(config)]
     answers = {config.name: _describe(build_method(config), wanted) for config in ours}
-    for index, result in guests.run(_describe_apart, asked):
+    for index, result in isolated.run(_describe_apart, asked):
         answers[asked[index][0].name] = _read_answer(result)
     refusals = [answer.refused for answer in answers.values() if answer.refused]
     if refusals:
@@ -82,7 +82,7 @@ def _describe(method: Method, categories: Sequence[str]) -> _Answer:
 
 
 def _describe_apart(asked: tuple[MethodConfig, tuple[str, ...]]) -> bytes:
-    """The same by a guest: whatever the method's code raises is a part of the answer."""
+    """The same in a process of its own: what the method's code raises is a part of the answer."""
     config, categories = asked
     try:
         answer = _describe(build_method(config), categories)

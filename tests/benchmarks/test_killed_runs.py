@@ -95,11 +95,11 @@ def _once_there(target: Callable[[], int | None], run: subprocess.Popen[bytes]) 
 
 
 def _a_worker(run: int) -> int | None:
-    """A guest: the run's server has forked its keeper, and the keeper has forked it."""
+    """A method's process: the run's server has forked its supervisor, which has forked it."""
     for server in _children(run):
-        for keeper in _children(server):
-            for guest in _children(keeper):
-                return guest
+        for supervisor in _children(server):
+            for job in _children(supervisor):
+                return job
     return None
 
 

@@ -1,4 +1,4 @@
-"""A method is a guest: whatever it does is its own row, and every other row is as without it."""
+"""Whatever a method does is its own row, and every other row is as without it."""
 
 import hashlib
 import json

@@ -1,8 +1,8 @@
 """Jobs that run code that is not ours: each in a process of its own, which leaves nothing behind.
 
-A server that has imported `preload` and done nothing else forks a keeper for every job, and the
-keeper forks the guest, which runs the job. So every job finds the same state, nothing that it
-changes outlives it, and what it starts or signals is its keeper's and no other job's.
+A server that has imported `preload` and done nothing else forks a supervisor for every job, and the
+supervisor forks the process that runs the job. So every job finds the same state, nothing that it
+changes outlives it, and what it starts or signals is its supervisor's and no other job's.
 """
 
 import multiprocessing
@@ -27,15 +27,15 @@ from extrap_train.jobs.fork_server import start_fork_server
 
 MAX_RESULT_BYTES = 2**30
 _TIMED_OUT = 124
-"""A keeper's exit status once the time of its guest was up, as that of `timeout`."""
+"""A supervisor's exit status once the time of its job was up, as that of `timeout`."""
 _IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _LOOK_EVERY_S = 0.01
 _GRACE_S = 10.0
-"""Until a keeper that its guest has stopped is killed, too."""
+"""Until a supervisor that its job has stopped is killed, too."""
 
 
 @dataclass(frozen=True)
-class GuestLauncher:
+class IsolatedLauncher:
     """Runs jobs that return bytes, `workers` at a time, each for at most `timeout_s` seconds.
 
     A job that ends without a result, in whatever way, is a `Died` with the reason. One whose
@@ -64,30 +64,30 @@ class GuestLauncher:
         self, job: Callable[[Item], bytes], items: Mapping[int, Item], workers: int
     ) -> Iterator[tuple[int, bytes | Died]]:
         waiting = iter(items.items())
-        running: dict[int, tuple[int, _Guest]] = {}
+        running: dict[int, tuple[int, _JobProcess]] = {}
         with ExitStack() as ends_all:
             while True:
                 for index, item in islice(waiting, workers - len(running)):
-                    guest = _Guest(self._start, job, item, self.timeout_s)
-                    ends_all.callback(guest.end)
-                    running[guest.process.sentinel] = (index, guest)
+                    started = _JobProcess(self._start, job, item, self.timeout_s)
+                    ends_all.callback(started.end)
+                    running[started.process.sentinel] = (index, started)
                 if not running:
                     return
                 wait_for_any([*running], timeout=1.0)
-                for sentinel, (index, guest) in [*running.items()]:
-                    if guest.is_over:
+                for sentinel, (index, started) in [*running.items()]:
+                    if started.is_over:
                         del running[sentinel]
-                        yield index, guest.result()
+                        yield index, started.result()
 
     def _start(self, arguments: tuple[Any, ...]) -> BaseProcess:
-        process = start_fork_server(self.preload).Process(target=_keep, args=arguments)
+        process = start_fork_server(self.preload).Process(target=_supervise, args=arguments)
         process.start()
         return process
 
 
 @dataclass(frozen=True)
-class AsGuest:
-    """A job for a launcher of processes that are ours, each of which runs it as a guest."""
+class Isolated:
+    """A job for a launcher of processes that are ours, each of which runs it in isolation."""
 
     job: Callable[[Any], bytes]
     timeout_s: float
@@ -95,7 +95,7 @@ class AsGuest:
 
     def __call__(self, item: Any) -> bytes | Died:
         """The job's result."""
-        ((_, result),) = GuestLauncher(1, self.timeout_s, self.preload).run(self.job, [item])
+        ((_, result),) = IsolatedLauncher(1, self.timeout_s, self.preload).run(self.job, [item])
         return result
 
 
@@ -103,7 +103,7 @@ class _Killed(Died):
     """Its process was killed, by itself or for want of memory."""
 
 
-class _Guest:
+class _JobProcess:
     """A job under way, seen from the process that waits for it."""
 
     def __init__(
@@ -148,7 +148,7 @@ class _Guest:
         if self._file.closed:
             return
         self._file.close()
-        # Its keeper leads a group that holds the guest and what that has started.
+        # The supervisor leads a group that holds the job's process and what that has started.
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self.process.pid or 0, signal.SIGKILL)
         self.process.kill()
@@ -170,7 +170,7 @@ def _received(duplicate: Any) -> int:
     return descriptor
 
 
-def _keep(
+def _supervise(
     job: Callable[[Item], bytes],
     item: Item,
     sink: int,
@@ -182,16 +182,16 @@ def _keep(
     multiprocessing.set_start_method(None, force=True)  # what the job starts, as anywhere else
     os.setsid()  # no Ctrl-C of the terminal reaches it
     for one in _IGNORED:
-        signal.signal(one, signal.SIG_IGN)  # a guest may send them to its parent
+        signal.signal(one, signal.SIG_IGN)  # a job may send them to its parent
     _adopt_orphans()
-    guest = os.fork()
-    if guest == 0:
-        _be_guest(job, item, sink, environment)
+    child = os.fork()
+    if child == 0:
+        _run_job(job, item, sink, environment)
     parent = multiprocessing.parent_process()
     assert parent is not None
     status, code = 0, _TIMED_OUT
     while True:
-        ended, status = os.waitpid(guest, os.WNOHANG)
+        ended, status = os.waitpid(child, os.WNOHANG)
         if ended:
             code = os.waitstatus_to_exitcode(status)
             break
@@ -205,7 +205,7 @@ def _keep(
     os._exit(code)
 
 
-def _be_guest(
+def _run_job(
     job: Callable[[Item], bytes], item: Item, sink: int, environment: Mapping[str, str]
 ) -> None:
     """Run the job and leave by the shortest way: threads and exit handlers are not waited for."""

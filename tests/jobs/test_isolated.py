@@ -1,4 +1,4 @@
-"""A guest's end is a result or a reason, and nothing of it stays."""
+"""A job's end is a result or a reason, and nothing of it stays."""
 
 import os
 import signal
@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from extrap_train.jobs import Died
-from extrap_train.jobs.guests import GuestLauncher
+from extrap_train.jobs.isolated import IsolatedLauncher
 from extrap_train.jobs.local import LocalLauncher
 from tests.jobs.test_launchers import _is_alive, linger
 
@@ -60,7 +60,7 @@ def act(item: tuple[str, str]) -> bytes:
 
 def _run(tmp_path: Path, *words: str, timeout_s: float = 300.0) -> dict[str, bytes | Died]:
     items = [(word, str(tmp_path)) for word in words]
-    done = dict(GuestLauncher(2, timeout_s).run(act, items))
+    done = dict(IsolatedLauncher(2, timeout_s).run(act, items))
     assert sorted(done) == [*range(len(words))]
     return {word: done[index] for index, word in enumerate(words)}
 
@@ -87,7 +87,7 @@ def test_every_end_is_a_result_or_a_reason(tmp_path: Path, monkeypatch: pytest.M
     assert not _is_alive(int(orphan.stem))
 
 
-def count_guests(folder: str) -> bytes:
+def count_running(folder: str) -> bytes:
     """How many run, this one included, when it begins; it takes longer than a look at them."""
     own = Path(folder) / f"{os.getpid()}.running"
     own.touch()
@@ -98,9 +98,9 @@ def count_guests(folder: str) -> bytes:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_no_more_guests_run_than_workers(tmp_path: Path, workers: int) -> None:
-    launcher = GuestLauncher(workers, timeout_s=300.0)
-    found = [result for _, result in launcher.run(count_guests, [str(tmp_path)] * (workers + 1))]
+def test_no_more_jobs_run_than_workers(tmp_path: Path, workers: int) -> None:
+    launcher = IsolatedLauncher(workers, timeout_s=300.0)
+    found = [result for _, result in launcher.run(count_running, [str(tmp_path)] * (workers + 1))]
     assert len(found) == workers + 1
     assert max(found) <= str(workers).encode()
 
