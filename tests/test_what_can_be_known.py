@@ -40,7 +40,7 @@ def _held_out(output: Path) -> tuple[PairBatch, Bool[Tensor, "b 1 h w"], Bool[Te
     )
     reader, pairs = ExampleReader([prepared], "test", _REFERENCES), prepared.pairs("test")
     chosen = linspace_indices(len(reader), _VIEWS)
-    batch = compute_warp(ValidationBatches(reader, chosen, _VIEWS)[0], _SIZE)
+    batch = compute_warp(ValidationBatches(reader, chosen, _VIEWS)[0].unpack(), _SIZE)
     captures = {s.name: s for s in read_category(output / "synthetic", "hydrant")}
     frames = [
         captures[pairs[i].sequence.split("/")[1]].frames[pairs[i].query].load() for i in chosen
