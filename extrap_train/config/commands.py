@@ -136,6 +136,7 @@ class SlurmConfig(LauncherConfig):
 
 TASKS = {
     "category": "prepare a category, train its model, and measure it on held-out sequences",
+    "check": "draw what proves or disproves a scene's poses, scale, lens and masks",
     "complete": "complete a scene all around: point cloud, views, Gaussians, turntable",
     "depth": "train the network that gives the views of task=complete their depth",
     "pack": "write a trained model as a packaged one",

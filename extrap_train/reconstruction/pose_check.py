@@ -34,7 +34,7 @@ def check_poses(views: Sequence[View]) -> None:
     """
     given: list[float] = []
     others: dict[str, list[float]] = {}
-    small = [_small(view) for view in views]
+    small = [small_view(view) for view in views]
     described = [(view.camera, detect_sift(view.image)) for view in small]
     for (one, features), (other, other_features) in pairwise(described):
         pairs = match_mutual(descriptor_distance(features, other_features), RATIO)
@@ -55,8 +55,9 @@ def check_poses(views: Sequence[View]) -> None:
         )
 
 
-def _small(view: View) -> View:
-    scale = SIDE / max(view.camera.height, view.camera.width)
+def small_view(view: View, side: int = SIDE) -> View:
+    """The view with at most this many pixels a side."""
+    scale = side / max(view.camera.height, view.camera.width)
     if scale >= 1:
         return view
     return view.resized(round(view.camera.height * scale), round(view.camera.width * scale))

@@ -1,0 +1,244 @@
+"""What matched features say of a capture's poses, scale, lens and masks.
+
+Each view is matched with its two nearest. Matches must lie on their epipolar lines (poses, lens).
+Points triangulated from a view and one neighbour must be seen by the other where it has them (the
+distances between cameras), and lie where depth files say (the unit of depth).
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from extrap_train.errors import InputError
+from extrap_train.geometry.cameras import project, unproject_to_world
+from extrap_train.geometry.epipolar import epipolar_distance, fundamental_matrix, triangulate
+from extrap_train.geometry.viewpoints import references_by_nearness
+from extrap_train.matching.sift import descriptor_distance, detect_sift, match_mutual
+from extrap_train.reconstruction.pose_check import (
+    FAR_PIXELS,
+    LEAST_MATCHES,
+    RATIO,
+    check_poses,
+    small_view,
+)
+from extrap_train.views import View, stack_poses
+
+SIDE = 960
+"""Photographs are matched at this many pixels a side, at most."""
+LEAST_POINTS = 8
+"""In a third view: they are sure already."""
+LEAST_PARALLAX_RAD = np.deg2rad(1.5)
+"""Between two rays whose meeting point is used."""
+MIDDLE, BORDER = 0.4, 0.7
+"""Of half the diagonal: within the one and beyond the other a lens is compared with itself."""
+LENS_PIXELS, LENS_RATIO = 1.5, 3.0
+"""A border whose matches lie so far off, and so many times farther than the middle's, is bent."""
+DEPTH_RATIO = 1.25
+MASK_DISAGREEMENT = 0.3
+"""Of the matched points on the object in one view or the other."""
+MASK_SHARES = (0.002, 0.95)
+"""Of a picture: a mask of less or more is no object's."""
+
+
+@dataclass(frozen=True)
+class MatchedViews:
+    """A view and its two nearest, with pixels of the same features."""
+
+    views: tuple[int, int, int]
+    """Indices: the view itself, then the nearest."""
+    pixels: Float[np.ndarray, "n 2"]
+    matches: Float[np.ndarray, "n 2"]
+    """In the nearest view."""
+    distances: Float[np.ndarray, " n"]
+    """Of the matches from the epipolar lines of the pixels, in pixels."""
+    points: Float[Tensor, "n 3"]
+    """Triangulated from both; NaN where the rays meet at too small an angle or not at all."""
+    third: Float[np.ndarray, "m 2"]
+    """Matches in the second nearest view of those with a point."""
+    reprojected: Float[np.ndarray, "m 2"]
+    """Where that view should have them."""
+
+    @property
+    def distance(self) -> float:
+        """Median distance from the epipolar lines; NaN for too few matches."""
+        return _median(self.distances)
+
+    @property
+    def reprojection(self) -> float:
+        """Median distance in the third view; NaN for too few matches."""
+        errors = np.linalg.norm(self.third - self.reprojected, axis=1)
+        return _median(errors, LEAST_POINTS)
+
+
+@dataclass(frozen=True)
+class CaptureCheck:
+    """What was found of a capture."""
+
+    views: list[View]
+    """At the size at which they were matched."""
+    matched: list[MatchedViews]
+    """One for each view, in order."""
+    problems: list[str] = field(default_factory=list)
+    """One line each."""
+
+
+def check_capture(views: Sequence[View]) -> CaptureCheck:
+    """Match three views or more; every problem names its views and likely cause."""
+    small = [small_view(view, SIDE) for view in views]
+    cameras = stack_poses([view.camera for view in small])
+    nearest = references_by_nearness(cameras, cameras)
+    features = [detect_sift(view.image) for view in small]
+    matched = []
+    for index, order in enumerate(nearest.tolist()):
+        one, two = [other for other in order if other != index][:2]
+        pairs, others = (
+            match_mutual(descriptor_distance(features[index], features[k]), RATIO)
+            for k in (one, two)
+        )
+        pixels = features[index].pixels[pairs[:, 0]]
+        matches = features[one].pixels[pairs[:, 1]]
+        matched.append(
+            _measure(small, (index, one, two), pixels, matches, pairs, others, features[two].pixels)
+        )
+    check = CaptureCheck(small, matched)
+    check.problems.extend(_problems(check))
+    return check
+
+
+def _measure(
+    views: Sequence[View],
+    indices: tuple[int, int, int],
+    pixels: Float[np.ndarray, "n 2"],
+    matches: Float[np.ndarray, "n 2"],
+    pairs: Int[np.ndarray, "n 2"],
+    others: Int[np.ndarray, "m 2"],
+    third_pixels: Float[np.ndarray, "k 2"],
+) -> MatchedViews:
+    camera, nearest, third = (views[index].camera for index in indices)
+    distances = epipolar_distance(pixels, matches, fundamental_matrix(camera, nearest))
+    found = triangulate(
+        torch.from_numpy(pixels).float(), torch.from_numpy(matches).float(), camera, nearest
+    )
+    usable = (found.depth > 0) & (found.parallax_rad > LEAST_PARALLAX_RAD)
+    points = _points(pixels, torch.where(usable, found.depth, torch.nan), views[indices[0]])
+    _, in_pairs, in_others = np.intersect1d(
+        pairs[:, 0], others[:, 0], assume_unique=True, return_indices=True
+    )
+    kept = usable.numpy()[in_pairs] & (distances[in_pairs] < FAR_PIXELS)
+    reprojected, _ = project(points[in_pairs[kept]], third)
+    seen = third_pixels[others[in_others[kept], 1]]
+    return MatchedViews(indices, pixels, matches, distances, points, seen, reprojected.numpy())
+
+
+def _points(
+    pixels: Float[np.ndarray, "n 2"], depth: Float[Tensor, " n"], view: View
+) -> Float[Tensor, "n 3"]:
+    rays = np.concatenate([pixels, np.ones((len(pixels), 1))], 1)
+    rays = torch.from_numpy(rays).float() @ torch.linalg.inv(view.camera.intrinsics).mT
+    matrix = view.camera.cam_to_world
+    return (depth[:, None] * rays) @ matrix[:3, :3].mT + matrix[:3, 3]
+
+
+def _median(values: Float[np.ndarray, " n"], least: int = LEAST_MATCHES) -> float:
+    return float(np.median(values)) if len(values) >= least else float("nan")
+
+
+def _problems(check: CaptureCheck) -> Iterator[str]:
+    try:
+        check_poses(check.views)
+    except InputError as error:
+        yield str(error)
+    names = [view.name for view in check.views]
+    lone = [names[m.views[0]] for m in check.matched if len(m.distances) < LEAST_MATCHES]
+    if lone:
+        yield f"overlap: {_listed(lone)} share too few features with the nearest view to say more"
+    off = [m for m in check.matched if m.distance > FAR_PIXELS]
+    if off:
+        worst = max(off, key=lambda m: m.distance)
+        yield (
+            f"poses: in {_listed([names[m.views[0]] for m in off])} matches lie up to "
+            f"{worst.distance:.1f} px from their epipolar lines: a pose or focal length is wrong"
+        )
+    stretched = [m for m in check.matched if m.distance <= FAR_PIXELS < m.reprojection / 2]
+    if stretched:
+        yield (
+            f"scale: points seen from {_listed([names[m.views[0]] for m in stretched])} are up to "
+            f"{max(m.reprojection for m in stretched):.1f} px from where a third view has them: "
+            "the distances between cameras do not agree"
+        )
+    yield from _lens_problem(check)
+    yield from _depth_problem(check)
+    yield from _mask_problems(check)
+
+
+def _lens_problem(check: CaptureCheck) -> Iterator[str]:
+    radius, distance = [], []
+    for each in check.matched:
+        camera = check.views[each.views[0]].camera
+        middle = np.array([camera.width, camera.height]) / 2
+        radius.append(np.linalg.norm((each.pixels - middle) / np.linalg.norm(middle), axis=1))
+        distance.append(each.distances)
+    radii, distances = np.concatenate(radius), np.concatenate(distance)
+    inner, outer = _median(distances[radii < MIDDLE]), _median(distances[radii > BORDER])
+    if outer > max(LENS_PIXELS, LENS_RATIO * inner):
+        yield (
+            f"lens: matches near the border lie {outer:.1f} px from their epipolar lines, in the "
+            f"middle {inner:.1f} px: its distortion is wrong or missing"
+        )
+
+
+def _depth_problem(check: CaptureCheck) -> Iterator[str]:
+    ratios = []
+    for each in check.matched:
+        view = check.views[each.views[0]]
+        if view.depth is None:
+            continue
+        column, row = each.pixels.astype(int).T
+        stored = view.depth[row, column]
+        points = unproject_to_world(view.depth, view.camera)[row, column]
+        center = view.camera.center
+        ratio = (points - center).norm(dim=1) / (each.points - center).norm(dim=1)
+        kept = (stored > 0) & torch.from_numpy(each.distances < FAR_PIXELS)
+        ratios.append(ratio[kept & ratio.isfinite()].numpy())
+    ratio = _median(np.concatenate(ratios)) if ratios else float("nan")
+    if abs(np.log(ratio)) > np.log(DEPTH_RATIO):
+        yield (
+            f"scale: depth files say {ratio:.3g} times the depth that the cameras do: correct the "
+            "unit of depth or the scale of the poses"
+        )
+
+
+def _mask_problems(check: CaptureCheck) -> Iterator[str]:
+    least, most = MASK_SHARES
+    for view in check.views:
+        if view.mask is not None and not least <= float(view.mask.mean()) <= most:
+            yield f"masks: that of {view.name} covers {view.mask.mean():.1%} of the picture"
+    for each in check.matched:
+        one, other = (check.views[k] for k in each.views[:2])
+        if one.mask is None or other.mask is None:
+            continue
+        near = each.distances < FAR_PIXELS / 2
+        first, second = (
+            _inside(one.mask, each.pixels[near]),
+            _inside(other.mask, each.matches[near]),
+        )
+        either = int((first | second).sum())
+        differ = int((first ^ second).sum())
+        if either >= LEAST_MATCHES and differ > MASK_DISAGREEMENT * either:
+            yield (
+                f"masks: those of {one.name} and {other.name} cut out different things "
+                f"({differ} of {either} matched points)"
+            )
+
+
+def _inside(mask: Float[Tensor, "h w"], pixels: Float[np.ndarray, "n 2"]) -> np.ndarray:
+    column, row = pixels.astype(int).T
+    return mask.numpy()[row, column] > 0.5
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")

@@ -1,0 +1,49 @@
+"""`task=check`: one picture that proves a scene's poses, scale, lens and masks, or shows faults."""
+
+from extrap_train.config import TrainConfig
+from extrap_train.data.scene_views import select_input_frames
+from extrap_train.data.square_frames import load_readable
+from extrap_train.errors import InputError
+from extrap_train.reconstruction.capture_check import check_capture
+from extrap_train.reconstruction.check_picture import draw_check
+from extrap_train.store.manifest import claim
+from extrap_train.tasks.scene_inputs import (
+    label_of,
+    open_sequence,
+    result_folder,
+    scene_manifest,
+)
+from extrap_train.terminal import terminal
+
+MOST_VIEWS = 24
+"""Checked unless `inputs` or `input_frames` say otherwise."""
+LEAST_VIEWS = 3
+
+
+def run(config: TrainConfig) -> None:
+    """Draw `check.png` in place of an earlier one, and print one line for each thing found."""
+    sequence = open_sequence(config)
+    count = config.inputs or min(len(sequence.frames), MOST_VIEWS)
+    chosen = select_input_frames(sequence, config.input_frames, count)
+    frames = [sequence.frames[index] for index in chosen]
+    unreadable: list[str] = []
+    views = list(load_readable(frames, unreadable, depth=True))
+    if len(views) < LEAST_VIEWS:
+        why = f"; {unreadable[0]}" if unreadable else ""
+        raise InputError(
+            f"scene {config.scene}: has {len(views)} readable views, and a check takes at least "
+            f"{LEAST_VIEWS}{why}"
+        )
+    check = check_capture(views)
+    check.problems.extend(unreadable)
+    folder, console = result_folder(config, label_of(sequence)), terminal()
+    manifest = scene_manifest(config, frames, {}, {})
+    with claim(folder, manifest, resume=False) as result, result.replace() as whole:
+        draw_check(check, whole / "check.png")
+    for problem in check.problems:
+        console.print(problem)
+    if not check.problems:
+        console.print(f"nothing looks wrong in {len(views)} of {len(sequence.frames)} views")
+    if not any(view.mask is not None for view in views):
+        console.print("no masks: the whole picture counts as the object's")
+    console.print(f"result: {folder / 'check.png'}")
