@@ -35,8 +35,9 @@ LEAST_PARALLAX_RAD = np.deg2rad(1.5)
 """Between two rays whose meeting point is used."""
 MIDDLE, BORDER = 0.4, 0.7
 """Of half the diagonal: within the one and beyond the other a lens is compared with itself."""
-LENS_PIXELS, LENS_RATIO = 1.5, 3.0
-"""A border whose matches lie so far off, and so many times farther than the middle's, is bent."""
+LENS_PIXELS, LENS_RATIO = 0.5, 3.0
+"""A border whose matches lie so far off, and so many times farther than the middle's, is bent: most
+of a distortion runs along the epipolar lines of an orbit and does not show."""
 DEPTH_RATIO = 1.25
 MASK_DISAGREEMENT = 0.3
 """Of the matched points on the object in one view or the other."""
