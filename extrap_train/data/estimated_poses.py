@@ -25,6 +25,7 @@ from extrap_train.data.colmap_files import read_model_cameras
 from extrap_train.data.colmap_model import read_model
 from extrap_train.data.images import read_photograph, to_eight_bits
 from extrap_train.data.listed_files import PICTURE_SUFFIXES
+from extrap_train.data.paths import require_file
 from extrap_train.data.picture_files import upright_photograph
 from extrap_train.data.sequences import FrameSequence
 from extrap_train.data.structure_from_motion import (
@@ -38,7 +39,7 @@ from extrap_train.data.structure_from_motion import (
 )
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import atomic_folder, remove_leftovers
-from extrap_train.store.digests import cache_folder, file_digest
+from extrap_train.store.digests import cache_folder, file_digest, folder_digest
 from extrap_train.store.manifest import MANIFEST, Manifest
 from extrap_train.store.records import write_record
 from extrap_train.terminal import progress
@@ -46,6 +47,7 @@ from extrap_train.terminal import progress
 MOST_PICTURES = 1000
 _SUFFIXES = (*PICTURE_SUFFIXES, ".heic", ".heif")
 _MOST_NAMED = 8
+_SEAL = "sparse.sha256"
 _REMEDY = (
     "take more pictures of the textured scene in small steps around it, or give a transforms.json "
     "or COLMAP model"
@@ -59,7 +61,8 @@ def find_pictures(folder: Path) -> list[str]:
     if not folder.is_dir():
         return []
     paths = (path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES)
-    return sorted(path.name for path in paths if not path.name.startswith(".") and path.is_file())
+    files = (path for path in paths if path.is_file() or path.is_symlink())  # broken ones are named
+    return sorted(path.name for path in files if not path.name.startswith("."))
 
 
 def read_unposed(folder: Path, pictures: Sequence[str], name: str) -> FrameSequence:
@@ -73,17 +76,25 @@ def read_unposed(folder: Path, pictures: Sequence[str], name: str) -> FrameSeque
             f"{folder}: has {len(pictures)} photographs without cameras, and those of at most "
             f"{MOST_PICTURES} are estimated; choose some, or run COLMAP yourself"
         )
+    pictures = _present(folder, pictures)
     settings = {"max_side": MAX_SIDE, "max_features": MAX_FEATURES, "seed": SEED}
     manifest = Manifest.of(settings, {name: file_digest(folder / name) for name in pictures})
     content = json.dumps([manifest.options, sorted(manifest.inputs.items())])
     key = hashlib.sha256(content.encode()).hexdigest()[:16]
     plain_name = re.sub(r"[^\w.-]", "_", name)[:60]
     stored = cache_folder("poses") / f"{plain_name}-{key}"
-    if not stored.is_dir():
-        remove_leftovers(stored.parent)
-        with atomic_folder(stored, Path.is_dir) as made:
-            _estimate(folder, pictures, made)
-            write_record(made / MANIFEST, manifest)
+    if not _is_sound(stored):
+        try:
+            remove_leftovers(stored.parent)
+            with atomic_folder(stored, _is_sound) as made:
+                _estimate(folder, pictures, made)
+                write_record(made / MANIFEST, manifest)
+                (made / _SEAL).write_text(folder_digest(made / "sparse"))
+        except OSError as error:
+            raise InputError(
+                f"{error.filename or stored}: {error.strerror}, so that estimated cameras cannot "
+                "be kept; set XDG_CACHE_HOME to a folder of yours with room"
+            ) from None
         log.warning("%s: cameras estimated from the photographs are kept in %s", folder, stored)
     sequence = read_model(stored / "sparse" / "0", folder, name, upright=True)
     placed = {frame.name for frame in sequence.frames}
@@ -100,6 +111,30 @@ def read_unposed(folder: Path, pictures: Sequence[str], name: str) -> FrameSeque
         )
     reasons = tuple(f"{folder / picture}: could not be placed among the others" for picture in lost)
     return replace(sequence, left_out=reasons, listed=tuple(pictures))
+
+
+def _present(folder: Path, pictures: Sequence[str]) -> list[str]:
+    """Those that are files, or links to files, with names that can be written down."""
+    present = []
+    for name in pictures:
+        try:
+            name.encode()
+            require_file(folder / name)
+        except UnicodeEncodeError:
+            log.warning("%s: %a is left out: its name is not UTF-8; rename it", folder, name)
+        except InputError as error:
+            log.warning("%s", error)
+        else:
+            present.append(name)
+    return present
+
+
+def _is_sound(stored: Path) -> bool:
+    """Whether the model is there as it was written."""
+    seal = stored / _SEAL
+    if not seal.is_file():
+        return False
+    return seal.read_bytes() == folder_digest(stored / "sparse").encode()
 
 
 def _estimate(folder: Path, pictures: Sequence[str], made: Path) -> None:
@@ -157,7 +192,8 @@ def _write_grey(folder: Path, pictures: Sequence[str], work: Path) -> list[Share
 def _run(work: Path, count: int) -> None:
     """Run `structure_from_motion` on a job."""
     module = "extrap_train.data.structure_from_motion"
-    command = [sys.executable, "-m", module, str(work), str(torch.get_num_threads())]
+    # -P: modules are not looked for in the current folder, which may be the photographs'.
+    command = [sys.executable, "-P", "-m", module, str(work), str(torch.get_num_threads())]
     errors = work / "errors.txt"
     with (
         progress("estimating cameras", count_steps(count), "pictures and pairs") as bar,

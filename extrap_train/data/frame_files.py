@@ -29,7 +29,7 @@ FRAMES, CAMERAS = "frames.npy", "frames.parquet"
 """A sequence's encoded frames (`frame_codec`), one after the other, and their table."""
 REMEDY = "run data_prep again, which makes what is damaged once more"
 _PARTS = ("image", "depth")
-_KEY, _SIZES = b"key", b"sizes"
+_KEY, _SIZES, _DIGEST = b"key", b"sizes", b"sha256"
 _SAFE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}")
 
 
@@ -181,37 +181,54 @@ def write_frames(place: "SealedTable", frames: SequenceFrames) -> None:
 class SealedTable:
     """A table that seals the arrays beside it, in a folder that is there whole or not at all.
 
-    It holds `key`, what it was made from, and how long each file must be: what the disk has made
-    of them is compared with that, not with itself.
+    It holds `key`, what it was made from, how long each file must be, and its own digest: what the
+    disk has made of them is compared with that, not with itself.
     """
 
     file: Path
     key: str
 
     def is_there(self) -> bool:
-        """Whether the table is there, made from `key`, and the files beside it are as long."""
-        try:
-            seal = pq.read_schema(self.file).metadata or {}
-            sizes = TypeAdapter(dict[str, int]).validate_json(seal.get(_SIZES, b""), strict=True)
-        except (OSError, pa.ArrowException, ValidationError):
-            return False
-        stamps = [(file_stamp(self.file.with_name(name)), size) for name, size in sizes.items()]
-        is_whole = all(stamp is not None and stamp[0] == size for stamp, size in stamps)
-        return seal.get(_KEY) == self.key.encode() and is_whole
+        """Whether the table is there, as it was written and made from `key`, and the files beside
+        it are as long."""
+        return self.read() is not None
 
     def read(self) -> pa.Table | None:
         """The table, if `is_there`."""
         try:
-            return pq.read_table(self.file) if self.is_there() else None
-        except (OSError, pa.ArrowException):
+            table = pq.read_table(self.file)
+            seal = table.schema.metadata or {}
+            sizes = TypeAdapter(dict[str, int]).validate_json(seal.get(_SIZES, b""), strict=True)
+            is_sound = seal.get(_DIGEST) == _digest(table)
+        except (OSError, pa.ArrowException, ValidationError, UnicodeDecodeError):
             return None
+        stamps = [(file_stamp(self.file.with_name(name)), size) for name, size in sizes.items()]
+        is_whole = all(stamp is not None and stamp[0] == size for stamp, size in stamps)
+        return table if is_sound and is_whole and seal.get(_KEY) == self.key.encode() else None
 
     def write(self, table: pa.Table, arrays: Mapping[str, Shaped[np.ndarray, "..."]]) -> None:
         """Write the arrays by their files' names, and the table; what is there whole stays."""
         with atomic_folder(self.file.parent, lambda _: self.is_there()) as made:
             sizes = {name: save_array(made / name, arrays[name]) for name in sorted(arrays)}
             seal = {_KEY: self.key.encode(), _SIZES: json.dumps(sizes).encode()}
+            seal[_DIGEST] = _digest(_as_read(table))
             pq.write_table(table.replace_schema_metadata(seal), made / self.file.name)
+
+
+def _as_read(table: pa.Table) -> pa.Table:
+    """The table with the types that it has once it was read from a file."""
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink)
+    return pq.read_table(pa.BufferReader(sink.getvalue()))
+
+
+def _digest(table: pa.Table) -> bytes:
+    """SHA-256 of the names, types and values of a table's columns."""
+    sink = pa.BufferOutputStream()
+    plain = table.replace_schema_metadata(None).combine_chunks()
+    with pa.ipc.new_stream(sink, plain.schema) as stream:
+        stream.write_table(plain)
+    return sha256(sink.getvalue()).hexdigest().encode()
 
 
 def _camera_table(frames: SequenceFrames, depth_scale: float) -> pa.Table:

@@ -37,6 +37,12 @@ REFUSED = {
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")
 """nerfstudio's order in `distortion_params`."""
+_FOREIGN = {
+    model.name: tuple(key for key in _COEFFICIENTS if key not in model.parameters)
+    for model in CAMERA_MODELS
+    if not model.fisheye and model.name not in ("OPENCV", RATIONAL)
+}
+"""Coefficients that a perspective `camera_model` does not have; nerfstudio's OPENCV has k3, k4."""
 _SPELLINGS = (
     (("fl_x",), ("x_fov",), ("camera_angle_x",)),
     (("fl_y",), ("y_fov",), ("camera_angle_y",)),
@@ -81,8 +87,11 @@ def lens_of(entry: dict[str, Any], height: int, width: int) -> Lens:
 
 
 def _lens_with_distortion(entry: dict[str, Any], pinhole: dict[str, float]) -> Lens:
-    model, coefficients = entry.get("camera_model", PERSPECTIVE), _coefficients(entry)
-    if _is_fisheye(entry, model):
+    model = entry.get("camera_model", PERSPECTIVE)
+    fisheye = _is_fisheye(entry, model)
+    coefficients = _coefficients(entry, fisheye)
+    _require_zero(coefficients, _FOREIGN.get(model, ()), f"camera_model {model}")
+    if fisheye:
         _require_zero(coefficients, ("p1", "p2", "k5", "k6"), "a fisheye lens")
         return lens_from_parameters(pinhole | coefficients, fisheye=True)
     if model == RATIONAL:
@@ -109,13 +118,18 @@ def _focal(entry: dict[str, Any], axis: str, side: int) -> float | None:
     return None
 
 
-def _coefficients(entry: dict[str, Any]) -> dict[str, float]:
+def _coefficients(entry: dict[str, Any], fisheye: bool) -> dict[str, float]:
     found = {key: number_of(entry, key) for key in _COEFFICIENTS if key in entry}
     listed = entry.get("distortion_params")
     if not _says_something(listed):
         return found
     if not isinstance(listed, list) or len(listed) not in (4, len(_PARAMS)):
         raise ValueError(f"distortion_params {listed!r:.60} are not {', '.join(_PARAMS)}")
+    if len(listed) == 4 and not fisheye and _says_something(listed[2:]):
+        raise ValueError(
+            f"distortion_params {listed!r:.60} may end in k3, k4 or in p1, p2: give all of "
+            f"{', '.join(_PARAMS)}"
+        )
     from_list = {
         key: number_of({"distortion_params": value}, "distortion_params")
         for key, value in zip(_PARAMS, listed, strict=False)

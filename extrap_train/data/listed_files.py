@@ -3,6 +3,7 @@
 import difflib
 import os
 import posixpath
+import unicodedata
 from collections.abc import Iterable, Sequence
 from itertools import islice
 from pathlib import Path
@@ -27,7 +28,7 @@ class ListedFiles:
         """The path below the root that `listed` means, None where there is no such file.
 
         Tried in turn: the path itself; `\\` as a stroke; with one of the `suffixes` added; and each
-        of these in another case, where only one file is called so.
+        of these in another case or Unicode form, where only one file is called so.
         """
         spellings = [listed, listed.replace("\\", "/")] if "\\" in listed else [listed]
         candidates = [
@@ -59,20 +60,25 @@ class ListedFiles:
         return f"there is no {path}"
 
     def _alike(self, path: str) -> list[str]:
-        """The names in the path's folder that are its own but for case."""
+        """The names in the path's folder that are its own but for case and Unicode form."""
         folder, name = posixpath.split(path)
-        return self._in(folder).get(name.casefold(), [])
+        return self._in(folder).get(_folded(name), [])
 
     def _in(self, folder: str) -> dict[str, list[str]]:
-        """The names in a folder, by their spelling without case."""
+        """The names in a folder, by what they have in common with names alike."""
         if folder not in self._folders:
             names = self._folders.setdefault(folder, {})
             try:
                 for path in sorted((self.root / folder).iterdir()):
-                    names.setdefault(path.name.casefold(), []).append(path.name)
+                    names.setdefault(_folded(path.name), []).append(path.name)
             except OSError:
                 pass  # nothing is in a folder that is not there
         return self._folders[folder]
+
+
+def _folded(name: str) -> str:
+    """The same for names that differ in case or in how accents are composed."""
+    return unicodedata.normalize("NFC", name).casefold()
 
 
 def _is_file(path: Path) -> bool:

@@ -222,11 +222,14 @@ def _normal(listed: str) -> str:
 
 
 def _frame_names(paths: Sequence[str]) -> list[str]:
-    """File names where these are unique, else whole paths with the folders joined by `_`."""
-    names = [Path(path).name for path in paths]
-    if len(set(names)) == len(names):
-        return names
-    return ["_".join(Path(path).parts) for path in paths]
+    """File names where these are unique, else whole paths with the folders joined by `_`, or by as
+    many of them as it takes.
+    """
+    names, separator = [Path(path).name for path in paths], ""
+    while len(set(names)) < len(names):
+        separator += "_"
+        names = [separator.join(Path(path).parts) for path in paths]
+    return names
 
 
 def _at_its_size(root: Path, photo: Photograph) -> Photograph:

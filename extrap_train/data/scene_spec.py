@@ -4,7 +4,7 @@ from pathlib import Path
 
 from extrap_train.config import SyntheticConfig
 from extrap_train.data.camera_check import CO3D_POSES, find_pose_fault
-from extrap_train.data.co3d import read_sequence
+from extrap_train.data.co3d import FRAME_ANNOTATIONS, read_sequence
 from extrap_train.data.colmap_model import find_model, read_model
 from extrap_train.data.estimated_poses import find_pictures, read_unposed
 from extrap_train.data.sequences import FrameSequence
@@ -18,6 +18,12 @@ SYNTHETIC_SCHEME = "synthetic:"
 KNOWN_FORMS = (
     "co3d:ROOT/category/sequence, a folder with a transforms.json, a folder with a COLMAP model "
     "(sparse/0 beside images), a folder of photographs, or synthetic:category/0003"
+)
+
+_CAMERA_FILES = (
+    TRANSFORMS,
+    *(f"{name}.{kind}" for name in ("cameras", "images") for kind in ("bin", "txt")),
+    "poses_bounds.npy",
 )
 
 
@@ -39,10 +45,28 @@ def open_scene(spec: str, synthetic: SyntheticConfig | None = None) -> FrameSequ
     name = folder.resolve().name
     if model := find_model(folder):
         return read_model(model, _images_folder(folder, model), name)
+    if file := _camera_like_file(folder):
+        raise InputError(
+            f"scene {spec!r}: {file} looks like cameras, but is no whole set of them "
+            "here; restore what belongs to it, or remove it, so that cameras are estimated; known "
+            f"are {KNOWN_FORMS}"
+        )
     for place in (folder, folder / "images"):
         if pictures := find_pictures(place):
             return read_unposed(place, pictures, name)
     raise InputError(f"scene {spec!r}: holds no camera file and no photographs; give {KNOWN_FORMS}")
+
+
+def _camera_like_file(folder: Path) -> Path | None:
+    """A file that is part of a description of cameras, where none is complete."""
+    if (annotations := folder.parent / FRAME_ANNOTATIONS).is_file():
+        return annotations
+    places = [
+        folder,
+        *(path for name in ("sparse", "colmap") for path in folder.glob(f"{name}/**")),
+    ]
+    files = (path for place in places for path in sorted(place.glob("*")))
+    return next((path for path in files if path.name.lower() in _CAMERA_FILES), None)
 
 
 def scene_address(spec: str) -> str:

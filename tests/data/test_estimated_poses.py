@@ -2,8 +2,10 @@
 
 import logging
 import math
+import os
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -185,6 +187,72 @@ def test_a_failing_process_is_one_line(tmp_path, monkeypatch):
         _save_noise(tmp_path / f"{seed}.png", seed=seed + 10)
     monkeypatch.setattr(estimated_poses, "write_job", lambda cameras, work: None)
     _expect_error(tmp_path, "pycolmap failed")
+
+
+@pytest.mark.usefixtures("no_mapping")
+@pytest.mark.parametrize(
+    "file",
+    [
+        "sparse/0/cameras.bin",
+        "colmap/sparse/0/images.txt",
+        "Transforms.json",
+        "poses_bounds.npy",
+        "../frame_annotations.jgz",
+    ],
+)
+def test_part_of_a_description_of_cameras_is_not_passed_over(tmp_path, file):
+    folder = tmp_path / "capture"
+    (folder / "images").mkdir(parents=True)
+    for seed in range(3):
+        _save_noise(folder / "images" / f"{seed}.png", seed)
+    (folder / file).parent.mkdir(parents=True, exist_ok=True)
+    (folder / file).write_bytes(b"")
+    _expect_error(folder, Path(file).name)
+
+
+@pytest.mark.usefixtures("no_mapping")
+def test_what_lies_in_the_cache_is_used_only_as_it_was_written(photographs, opened, cache):
+    (stored,) = (path for path in cache.iterdir() if path.is_dir())
+    for file in ("images.bin", "cameras.bin"):
+        path = stored / "sparse" / "0" / file
+        before = path.read_bytes()
+        path.write_bytes(before[:-30] + bytes([before[-30] ^ 1]) + before[-29:])
+        with pytest.raises(KeyboardInterrupt):  # it would be estimated again
+            open_scene(str(photographs[0]))
+        path.write_bytes(before)
+    assert len(open_scene(str(photographs[0])).frames) == len(opened.frames)
+
+
+def test_a_cache_that_is_no_folder_is_one_line(photographs, tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    _expect_error(photographs[0], "XDG_CACHE_HOME")
+
+
+def test_nothing_is_run_from_the_current_folder(photographs, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    for name in ("pycolmap", "json", "dataclasses"):
+        (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'EXECUTED')!r}, 'w')")
+    for view in photographs[1][:3]:
+        shutil.copy(photographs[0] / view.name, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    assert len(open_scene(".").frames) == 3
+    assert not (tmp_path / "EXECUTED").exists()
+
+
+@pytest.mark.usefixtures("no_mapping")
+def test_names_and_links_that_cannot_be_read_are_left_out_by_name(photographs, tmp_path, caplog):
+    """Before anything is estimated, which is interrupted here."""
+    for view in photographs[1][:3]:
+        shutil.copy(photographs[0] / view.name, tmp_path)
+    (tmp_path / "linked.png").symlink_to("../.git/annex/x")
+    shutil.copy(photographs[0] / "other.png", os.fsencode(tmp_path) + b"/Bild \xe4.png")
+    with caplog.at_level(logging.WARNING), pytest.raises(KeyboardInterrupt):
+        open_scene(str(tmp_path))
+    annex, latin = sorted(caplog.messages, key=lambda said: "UTF-8" in said)
+    assert "linked.png" in annex
+    assert "annex" in annex
+    assert "UTF-8" in latin
 
 
 def _expect_error(folder, match):

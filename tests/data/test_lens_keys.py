@@ -79,6 +79,12 @@ def test_a_list_of_coefficients_has_nerfstudios_order():
     assert listed == lens(**PINHOLE, **RADIAL, p1=0.001, p2=0.002)
 
 
+def test_four_coefficients_are_those_of_a_fisheye_or_have_no_more_than_two_terms():
+    fisheye = lens(**PINHOLE, is_fisheye=True, distortion_params=list(RADIAL.values()))
+    assert fisheye == lens(**PINHOLE, is_fisheye=True, **RADIAL)
+    assert lens(**PINHOLE, distortion_params=[0.1, 0.2, 0, 0]) == lens(**PINHOLE, k1=0.1, k2=0.2)
+
+
 @pytest.mark.parametrize(
     ("keys", "named"),
     [
@@ -95,6 +101,10 @@ def test_a_list_of_coefficients_has_nerfstudios_order():
         ({"distortion_params": [0.1] * 12}, "distortion_params"),
         ({"distortion_params": [0.1] * 6, "k1": 0.2}, "distortion_params"),
         ({"distortion_params": "none"}, "distortion_params"),
+        ({"distortion_params": [0.1, 0.01, 0.001, 0.002]}, "distortion_params"),
+        ({"camera_model": "PINHOLE", "k1": -0.2}, "k1"),
+        ({"camera_model": "SIMPLE_RADIAL", "k1": 0.1, "k2": 0.2}, "k2"),
+        ({"camera_model": "RADIAL", "k1": 0.1, "p1": 0.01}, "p1"),
         ({"fl_x": True}, "fl_x"),
         ({"cx": None}, "cx"),
         ({"k1": []}, "k1"),

@@ -1,5 +1,6 @@
 """Files are found where other loaders would find them, and what is there instead is said."""
 
+import unicodedata
 from pathlib import Path
 
 import pytest
@@ -41,6 +42,14 @@ def root(tmp_path: Path) -> Path:
 )
 def test_where_a_listed_file_is(root, listed, found):
     assert ListedFiles(root).find(listed, PICTURE_SUFFIXES) == found
+
+
+@pytest.mark.parametrize("form", ["NFC", "NFD"])
+def test_accents_may_be_composed_in_either_way(tmp_path, form):
+    other = {"NFC": "NFD", "NFD": "NFC"}[form]
+    (tmp_path / unicodedata.normalize(form, "Bild ä0.png")).touch()
+    listed = unicodedata.normalize(other, "Bild ä0.png")
+    assert ListedFiles(tmp_path).find(listed) == unicodedata.normalize(form, listed)
 
 
 def test_no_suffix_is_added_unasked(root):

@@ -108,6 +108,24 @@ def test_depth_survives_in_any_unit(exponent: float, seed: int, tmp_path_factory
     assert SealedTable(place.file, "another key").read() is None
 
 
+def test_no_flipped_bit_of_a_table_changes_its_cameras(tmp_path: Path) -> None:
+    camera, blank = ring(even(4)), np.zeros((4, 4, 4), np.uint8)
+    images, depths = np.stack([blank] * 3, -1), np.ones((4, 4, 4), np.float32)
+    place = SealedTable(tmp_path / "one" / "frames.parquet", "key")
+    write_frames(place, SequenceFrames(tuple("abcd"), camera, images, depths, blank))
+    whole, table = place.file.read_bytes(), place.read()
+    assert table is not None
+    rng, refused = np.random.default_rng(0), 0
+    for _ in range(300):
+        content = bytearray(whole)
+        content[rng.integers(len(whole))] ^= 1 << int(rng.integers(8))
+        place.file.write_bytes(content)
+        found = place.read()
+        refused += found is None
+        assert found is None or found.equals(table)
+    assert refused > 100
+
+
 @pytest.mark.parametrize(
     "name",
     [

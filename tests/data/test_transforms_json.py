@@ -20,6 +20,16 @@ def folder(tmp_path):
     return tmp_path / "capture"
 
 
+def test_every_frame_has_a_name_of_its_own(folder):
+    content = read_json(folder)
+    for frame, name in zip(content["frames"], ("a/1.png", "b/1.png", "a_1.png"), strict=True):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / frame["file_path"]).rename(folder / name)
+        frame["file_path"] = name
+    write_json(folder, content)
+    assert len({frame.name for frame in read_transforms(folder).frames}) == 3
+
+
 def test_what_was_photographed_is_read(folder):
     sequence = read_transforms(folder)
     assert sequence.name == "capture"
