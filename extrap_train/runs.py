@@ -25,7 +25,7 @@ from extrap_train.config import (
 from extrap_train.data.prepared import PreparedData
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import partial_path, write_atomic
-from extrap_train.store.digests import weights_digest
+from extrap_train.store.digests import folder_digest, weights_digest
 from extrap_train.store.manifest import (
     REMEDY,
     Conflict,
@@ -115,6 +115,8 @@ class Finished:
 
     steps: int
     provenance: _HowMeasured
+    model_sha256: str | None = None
+    """Of the folder of the model that was measured."""
 
     @classmethod
     def read(cls, folder: RunFolder) -> "Finished":
@@ -126,6 +128,19 @@ class Finished:
         """Whether the run was trained for at least these steps and measured in this way."""
         measured = dict(self.provenance.validation) == asdict(config.validation)
         return self.steps >= config.trainer.steps and measured
+
+    def has_its_model(self, folder: RunFolder) -> bool:
+        """Whether the run's model is there as it was measured."""
+        said = self.model_sha256
+        return said is None or (folder.model.is_dir() and folder_digest(folder.model) == said)
+
+    def require_its_model(self, folder: RunFolder) -> None:
+        """InputError if the run's model is missing or was changed since."""
+        if not self.has_its_model(folder):
+            raise InputError(
+                f"{folder.model}: is not the model that its run has measured, but damaged or "
+                "changed; the command of its training makes it again"
+            )
 
 
 def in_sweep() -> bool:

@@ -96,6 +96,21 @@ def test_a_second_run_says_that_it_is_done(undisturbed: Path) -> None:
     assert _weights(undisturbed) == before
 
 
+@pytest.mark.parametrize("damage", ["flipped", "missing"])
+def test_a_damaged_model_is_noticed_and_made_again_from_the_checkpoint(
+    undisturbed: Path, tmp_path: Path, damage: str
+) -> None:
+    shutil.copytree(undisturbed, tmp_path / "copy", symlinks=True)
+    before = _weights(tmp_path / "copy")
+    file = next((_run_folder(tmp_path / "copy") / "model" / "unet").glob("*.safetensors"))
+    content = file.read_bytes()
+    file.unlink()
+    if damage == "flipped":
+        file.write_bytes(content[:-9] + bytes([content[-9] ^ 1]) + content[-8:])
+    assert "is made again" in _finish(tmp_path / "copy")
+    assert _weights(tmp_path / "copy") == before
+
+
 def test_a_finished_run_is_measured_again_sampled_otherwise(
     undisturbed: Path, tmp_path: Path
 ) -> None:

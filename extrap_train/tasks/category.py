@@ -114,7 +114,9 @@ def _opened(
 def _opening(folder: RunFolder, config: TrainConfig, console: Console) -> Opening:
     finished = Finished.read(folder) if folder.summary.is_file() else None
     if finished is not None and finished.answers(config):
-        return Opening(is_finished=True, checkpoint=None)
+        if finished.has_its_model(folder):
+            return Opening(is_finished=True, checkpoint=None)
+        console.print(f"{folder.model}: is damaged or was changed, and is made again")
     newest = newest_intact(folder.checkpoints, console.print)
     if newest is None and finished is not None and finished.steps > config.trainer.steps:
         raise Conflict(

@@ -17,6 +17,7 @@ from extrap_train.errors import InputError
 from extrap_train.pictures import contact_sheet, curve, error_map, mark_holes
 from extrap_train.runs import RunFolder, provenance
 from extrap_train.store.atomic import write_atomic
+from extrap_train.store.digests import folder_digest
 from extrap_train.store.records import write_summary
 
 _ABOVE = "validation/above_baselines_db"
@@ -49,6 +50,7 @@ def write_results(
         "missing": missing,
         "seconds": seconds,
         "steps": steps,
+        **({"model_sha256": folder_digest(folder.model)} if folder.model.is_dir() else {}),
         "parameters": sum(p.numel() for p in measured.model.parameters()),
         "provenance": {**provenance(config, data), "validation": asdict(config.validation)},
     }

@@ -55,9 +55,10 @@ class UsedWeights:
             raise InputError(f"adapter={adapter}: no such folder; give an adapter of task=scene")
         run, steps = RunFolder(path.parent), packaged_steps(name)
         is_packaged = name in packaged_names()
-        if not is_packaged:
-            is_of_run = path == run.model and run.summary.is_file()
-            steps = Finished.read(run).steps if is_of_run else None
+        if not is_packaged and path == run.model and run.summary.is_file():
+            finished = Finished.read(run)
+            finished.require_its_model(run)
+            steps = finished.steps
         return cls(
             name=name,
             sha256=weights_digest(_folder_of(name)),

@@ -34,7 +34,9 @@ def run(config: TrainConfig, prepare: Prepare) -> Outcome:
     prepared = prepare(config)
     _require_as_trained(trained, config, prepared)
     seconds = {"prepare": time.perf_counter() - started}
-    steps = Finished.read(trained).steps
+    finished = Finished.read(trained)
+    finished.require_its_model(trained)
+    steps = finished.steps
     model = load_model(trained.model)
     sampler = sampler_for(config.sampler, model.config)
     options = {"sampler": asdict(sampler), "validation": asdict(config.validation)}
