@@ -49,7 +49,10 @@ def own_choices(tmp_path: Path) -> Path:
         (["category=hydrant", "~prep.image_size"], "prep.image_size"),
         (["hydrant"], "did you mean category=hydrant?"),
         (["-m", "category=hydrnt,apple"], "did you mean hydrant"),
-        (["category=hydrant", "task=scne"], "task=scne is unknown; known: category, complete"),
+        (
+            ["category=hydrant", "task=scne"],
+            "task=scne is unknown; known: category, check, complete",
+        ),
         (["category=hydrant", "model.prediction=eps"], "known: epsilon, v_prediction, sample"),
         (
             ["category=hydrant", "model.image_size=96"],
