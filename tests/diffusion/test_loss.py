@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from extrap_train.config import ModelConfig
+from extrap_train.diffusion.conditioning import Conditioning
 from extrap_train.diffusion.loss import Anchor, diffusion_loss, prediction_errors, snr_weights
 from extrap_train.diffusion.model import ExtrapolationModel, noise_schedule
 from extrap_train.views import PairBatch
@@ -107,3 +108,22 @@ def _left_half_error(model, target, noise, level, conditioning) -> torch.Tensor:
     }[model.config.prediction]
     error = (model(noisy, level, conditioning) - wanted).square()
     return error[..., : error.shape[-1] // 2].mean((1, 2, 3))
+
+
+@pytest.mark.parametrize(("share", "is_dropped"), [(0.0, False), (1.0, True)])
+def test_the_condition_is_dropped_for_the_share_that_is_asked_for(
+    config: ModelConfig,
+    batch: PairBatch,
+    monkeypatch: pytest.MonkeyPatch,
+    share: float,
+    is_dropped: bool,
+) -> None:
+    seen, zeroed = [], Conditioning.zeroed
+
+    def record(self: Conditioning, dropped: torch.Tensor) -> Conditioning:
+        seen.append(dropped)
+        return zeroed(self, dropped)
+
+    monkeypatch.setattr(Conditioning, "zeroed", record)
+    diffusion_loss(ExtrapolationModel(config), batch, torch.Generator().manual_seed(0), share)
+    assert [bool(each) for each in seen[0]] == [is_dropped] * len(batch.image)

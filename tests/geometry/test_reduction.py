@@ -1,6 +1,7 @@
 """Reducing a batch keeps what is known, where it lies, and which camera sees it."""
 
 import math
+from dataclasses import replace
 
 import torch
 
@@ -41,6 +42,22 @@ def test_a_block_is_the_mean_of_its_known_pixels() -> None:
     torch.testing.assert_close(reduced.coordinates[0, :, 0, 0], torch.full((2,), expected))
     torch.testing.assert_close(reduced.depth[0, 0], torch.tensor([expected, 0.0]))
     torch.testing.assert_close(reduced.weight[0, 0], torch.tensor([0.75, 0.0]))
+
+
+def test_the_nearest_reference_has_a_mask_of_its_own() -> None:
+    nearest = torch.tensor([[[1.0, 0, 0, 0], [0, 0, 0, 0]]])
+    warp = replace(warp_of([[1, 1, 1, 1], [1, 1, 1, 1]]), nearest_mask=nearest)
+    reduced = reduce_warp(warp, 2)
+    assert reduced.mask.tolist() == [[[1, 1]]]
+    assert reduced.nearest_mask.tolist() == [[[1, 0]]]
+
+
+def test_depth_is_that_of_a_pixel_beside_the_middle_of_its_block() -> None:
+    """Half a fine pixel off: the block's first pixel would be a pixel and a half off."""
+    batch = wall(8)
+    depths = torch.arange(64.0).view(1, 1, 8, 8)
+    reduced = reduce_batch(replace(batch, reference_depths=depths), 4)
+    assert reduced.reference_depths.flatten().tolist() == [18, 22, 50, 54]
 
 
 def test_holes_stay_zero_and_marked() -> None:
