@@ -46,7 +46,7 @@ from benchmarks.score.scoring import missing_networks
 from extrap_train.config import MethodConfig, TableConfig
 from extrap_train.errors import InputError
 from extrap_train.jobs import Died, Launcher
-from extrap_train.jobs.isolated import Isolated, IsolatedLauncher
+from extrap_train.jobs.isolated import IsolatedJob, IsolatedLauncher
 from extrap_train.jobs.local import LocalLauncher
 from extrap_train.jobs.slurm import slurm_launcher
 from extrap_train.store.atomic import file_lock, remove_leftovers
@@ -228,7 +228,7 @@ def _launchers(
     """What makes images, each cell's in a process of its own, and what scores them."""
     if options.launcher is not None or options.slurm:
         elsewhere = options.launcher or slurm_launcher(table.slurm, folder.path / "slurm")
-        alone = Isolated(run_method, isolated.timeout_s, isolated.preload)
+        alone = IsolatedJob(run_method, isolated.timeout_s, isolated.preload)
         yield partial(elsewhere.run, alone), elsewhere
         return
     # A further process loads for as long as it takes to score some cells here.

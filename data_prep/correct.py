@@ -52,8 +52,8 @@ class Correction:
     flow: Float[Tensor, "2 g g"] | None
     """Control vectors (`geometry.spline_flow`); None where the warp stays as it is."""
     error_before: float
-    """Photometric error of the warp against the truth; NaN of none. Over what the warp shows, and
-    once it is corrected over what both warps show.
+    """Photometric error of the warp against the truth; NaN of none. Over what the warp shows; for
+    an accepted correction, over what both warps show.
     """
     error_after: float
     """The same with the correction; `error_before` where there is none."""

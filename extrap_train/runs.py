@@ -138,8 +138,8 @@ class Finished:
         """InputError if the run's model is missing or was changed since."""
         if not self.has_its_model(folder):
             raise InputError(
-                f"{folder.model}: is not the model that its run has measured, but damaged or "
-                "changed; the command of its training makes it again"
+                f"{folder.model}: is missing, damaged or was changed since its run measured it; "
+                "run the command of its training again, which restores it"
             )
 
 

@@ -135,7 +135,7 @@ def row_of(number: int, seconds: float, job: JobReturn) -> Row:
 
 
 def _options(overrides: Iterable[str]) -> dict[str, str]:
-    """By name; but for `output`, so that a sweep goes on where its folder was moved to."""
+    """Options by name, without `output`: a sweep goes on where its folder was moved to."""
     options = dict(word.lstrip("+~").partition("=")[::2] for word in overrides)
     return {name: value for name, value in options.items() if name != "output"}
 

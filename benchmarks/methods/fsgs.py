@@ -175,8 +175,7 @@ def find_isolated(
 def pseudo_camera(
     cameras: Sequence[Camera], generator: torch.Generator, jitter: float = 0.05
 ) -> Camera:
-    """A camera on the way from one input to the input nearest to it, looking at the same
-    place.
+    """A camera between one input and the input nearest to it, looking at the same place.
 
     The position moves on the arc around the origin (the frame's centre) and is shifted by `jitter`
     times its distance at random; the viewing directions are averaged in the same share.

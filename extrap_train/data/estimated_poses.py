@@ -40,8 +40,6 @@ from extrap_train.data.structure_from_motion import (
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import atomic_folder, remove_leftovers
 from extrap_train.store.digests import cache_folder, file_digest, folder_digest
-from extrap_train.store.manifest import MANIFEST, Manifest
-from extrap_train.store.records import write_record
 from extrap_train.terminal import progress
 
 MOST_PICTURES = 1000
@@ -78,8 +76,7 @@ def read_unposed(folder: Path, pictures: Sequence[str], name: str) -> FrameSeque
         )
     pictures = _present(folder, pictures)
     settings = {"max_side": MAX_SIDE, "max_features": MAX_FEATURES, "seed": SEED}
-    manifest = Manifest.of(settings, {name: file_digest(folder / name) for name in pictures})
-    content = json.dumps([manifest.options, sorted(manifest.inputs.items())])
+    content = json.dumps([settings, {p: file_digest(folder / p) for p in sorted(pictures)}])
     key = hashlib.sha256(content.encode()).hexdigest()[:16]
     plain_name = re.sub(r"[^\w.-]", "_", name)[:60]
     stored = cache_folder("poses") / f"{plain_name}-{key}"
@@ -88,7 +85,6 @@ def read_unposed(folder: Path, pictures: Sequence[str], name: str) -> FrameSeque
             remove_leftovers(stored.parent)
             with atomic_folder(stored, _is_sound) as made:
                 _estimate(folder, pictures, made)
-                write_record(made / MANIFEST, manifest)
                 (made / _SEAL).write_text(folder_digest(made / "sparse"))
         except OSError as error:
             raise InputError(

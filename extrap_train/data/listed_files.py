@@ -65,7 +65,7 @@ class ListedFiles:
         return self._in(folder).get(_folded(name), [])
 
     def _in(self, folder: str) -> dict[str, list[str]]:
-        """The names in a folder, by what they have in common with names alike."""
+        """The names in a folder, by their folded form."""
         if folder not in self._folders:
             names = self._folders.setdefault(folder, {})
             try:

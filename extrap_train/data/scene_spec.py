@@ -47,9 +47,9 @@ def open_scene(spec: str, synthetic: SyntheticConfig | None = None) -> FrameSequ
         return read_model(model, _images_folder(folder, model), name)
     if file := _camera_like_file(folder):
         raise InputError(
-            f"scene {spec!r}: {file} looks like cameras, but is no whole set of them "
-            "here; restore what belongs to it, or remove it, so that cameras are estimated; known "
-            f"are {KNOWN_FORMS}"
+            f"scene {spec!r}: {file} describes cameras, but not in a form that is read "
+            "here, or files that belong to it are missing; restore them, or remove it to have "
+            f"cameras estimated; known are {KNOWN_FORMS}"
         )
     for place in (folder, folder / "images"):
         if pictures := find_pictures(place):

@@ -3,7 +3,7 @@
 `python -m extrap_train.data.structure_from_motion FOLDER THREADS` reads `FOLDER/job.json` and the
 grey pictures that it names, writes a COLMAP model to `FOLDER/sparse/0` unless no three pictures
 belong together, and prints on each line how many more of `count_steps` are done. pycolmap handles
-signals in its own way once it is imported and ends the process where it fails: hence the process.
+signals in its own way once it is imported, and may end the process: so it has one of its own.
 """
 
 import json

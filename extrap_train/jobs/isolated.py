@@ -86,8 +86,8 @@ class IsolatedLauncher:
 
 
 @dataclass(frozen=True)
-class Isolated:
-    """A job for a launcher of processes that are ours, each of which runs it in isolation."""
+class IsolatedJob:
+    """A job for another launcher, whose processes each run it in a process of its own."""
 
     job: Callable[[Any], bytes]
     timeout_s: float

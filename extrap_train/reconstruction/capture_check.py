@@ -32,7 +32,7 @@ SIDE = 960
 LEAST_POINTS = 8
 """In a third view: they are sure already."""
 LEAST_PARALLAX_RAD = np.deg2rad(1.5)
-"""Between two rays whose meeting point is used."""
+"""Between two rays, for the point where they meet to be used."""
 MIDDLE, BORDER = 0.4, 0.7
 """Of half the diagonal: within the one and beyond the other a lens is compared with itself."""
 LENS_PIXELS, LENS_RATIO = 0.5, 3.0

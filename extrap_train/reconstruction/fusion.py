@@ -19,7 +19,7 @@ from extrap_train.views import stack_cameras
 _TRUNCATION = 0.02
 """Relative difference of depth up to which two views may show the same surface."""
 _REACH = 3 * _TRUNCATION
-"""How far a surface may move."""
+"""How far a surface may move along its rays, relative to its depth."""
 _SAMPLES = 25
 
 
@@ -58,8 +58,8 @@ def _fuse(view: MapView, known: GlobalMap) -> tuple[Float[Tensor, "h w"], Float[
 def _signed_distance(
     points: Float[Tensor, "n 3"], view: MapView
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-    """How far each point lies in front of the view's surface, in truncations, at most 1, and how
-    sure that is: not at all farther than one truncation behind it, where the view sees nothing.
+    """How far each point lies in front of the view's surface, in truncations and at most 1; and its
+    weight, the view's confidence: 0 beyond one truncation behind the surface, which hides the rest.
     """
     pixels, z = project(points, view.camera)
     column, row = pixels.floor().long().unbind(-1)

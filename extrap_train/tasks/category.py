@@ -116,7 +116,7 @@ def _opening(folder: RunFolder, config: TrainConfig, console: Console) -> Openin
     if finished is not None and finished.answers(config):
         if finished.has_its_model(folder):
             return Opening(is_finished=True, checkpoint=None)
-        console.print(f"{folder.model}: is damaged or was changed, and is made again")
+        console.print(f"{folder.model}: is missing, damaged or was changed, and is made again")
     newest = newest_intact(folder.checkpoints, console.print)
     if newest is None and finished is not None and finished.steps > config.trainer.steps:
         raise Conflict(
