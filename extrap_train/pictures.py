@@ -16,7 +16,7 @@ from matplotlib import font_manager
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from extrap_train.data.images import to_eight_bits
+from extrap_train.data.image_files import to_eight_bits
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import partial_path, replace_synced, write_atomic
 

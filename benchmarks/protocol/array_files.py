@@ -19,7 +19,7 @@ from pydantic import AfterValidator, Field
 from torch import Tensor
 
 from extrap_train.data.depth_files import ARRAY_ERRORS
-from extrap_train.data.picture_files import DECODER_ERRORS
+from extrap_train.data.image_files import DECODER_ERRORS
 from extrap_train.errors import InputError
 
 MAX_POINTS = 50_000_000

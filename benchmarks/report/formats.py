@@ -21,7 +21,7 @@ from benchmarks.protocol.prepared_scene import Scene
 from benchmarks.report.aggregate import Results
 from benchmarks.report.table_layout import Entry, Layout, name_of
 from benchmarks.run.cells import OK, Cell, one_line
-from extrap_train.data.images import to_eight_bits
+from extrap_train.data.image_files import to_eight_bits
 from extrap_train.errors import InputError
 from extrap_train.pictures import error_map
 

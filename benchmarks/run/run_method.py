@@ -31,7 +31,7 @@ from benchmarks.run.cells import (
     one_line,
 )
 from extrap_train.config import MethodConfig
-from extrap_train.data.images import to_eight_bits
+from extrap_train.data.image_files import to_eight_bits
 from extrap_train.errors import InputError
 from extrap_train.factories import make_object
 from extrap_train.jobs import Died

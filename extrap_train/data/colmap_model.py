@@ -13,10 +13,10 @@ from extrap_train.data.colmap_files import (
     read_model_cameras,
     read_model_images,
 )
+from extrap_train.data.image_files import MAX_PIXELS
 from extrap_train.data.listed_files import ListedFiles
 from extrap_train.data.paths import check_relative
 from extrap_train.data.photographs import Listed, Photograph, sequence_of_photographs
-from extrap_train.data.picture_files import MAX_PIXELS
 from extrap_train.data.sequences import FrameSequence, PointCloud
 from extrap_train.errors import InputError
 from extrap_train.geometry.colmap import (

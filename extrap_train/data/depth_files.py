@@ -6,12 +6,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Float, Shaped, UInt16
 from torch import Tensor
 
-from extrap_train.data.images import nearest_pixels, read_grey, require_mode
+from extrap_train.data.image_files import (
+    MAX_PIXELS,
+    nearest_pixels,
+    read_grey,
+    read_picture,
+    same_view,
+)
 from extrap_train.data.paths import require_file
-from extrap_train.data.picture_files import MAX_PIXELS, read_turned, same_view
 from extrap_train.errors import InputError
 
 ARRAY_ERRORS = (
@@ -40,13 +45,13 @@ class DepthFile:
 
     def read(self, root: Path, size: tuple[int, int]) -> Float[Tensor, "h w"]:
         """The depth in scene units at `size` (height, width); 0 where unknown or not trusted."""
-        path = require_file(root / self.path)
+        path = root / self.path
         if self.is_half_float:
             depth = known_depth(read_sixteen_bit(path, size).view(np.float16), self.scale, path)
         else:
             depth = read_depth(path, size, self.scale)
         if self.mask_path:
-            depth *= read_depth_mask(require_file(root / self.mask_path), size)
+            depth *= torch.from_numpy(read_grey(root / self.mask_path, size) > 0)
         return depth
 
 
@@ -58,19 +63,14 @@ def read_depth(path: Path, size: tuple[int, int], scale: float) -> Float[Tensor,
     if path.suffix.lower() == ".npy":
         raw = _read_npy(path, size)
     else:
-        raw = np.asarray(require_mode(read_turned(path, size, same_view), _DEPTH_MODES, path))
+        raw = np.asarray(read_picture(path, size, _DEPTH_MODES))
     return known_depth(nearest_pixels(raw, size), scale, path)
 
 
-def read_sixteen_bit(path: Path, size: tuple[int, int]) -> Shaped[np.ndarray, "h w"]:
-    """The raw values, uint16, of a greyscale PNG of 16 bits a pixel, resampled to `size`."""
-    picture = require_mode(read_turned(path, size, same_view), _SIXTEEN_BIT_MODES, path)
-    return nearest_pixels(np.asarray(picture).astype(np.uint16), size)
-
-
-def read_depth_mask(path: Path, size: tuple[int, int]) -> Float[Tensor, "h w"]:
-    """1 where the depth of a pixel is to be trusted, else 0; may be 0 everywhere."""
-    return torch.from_numpy(read_grey(path, size) > 0).float()
+def read_sixteen_bit(path: Path, size: tuple[int, int]) -> UInt16[np.ndarray, "h w"]:
+    """The raw values of a greyscale PNG of 16 bits a pixel, resampled to `size`."""
+    raw = np.asarray(read_picture(path, size, _SIXTEEN_BIT_MODES)).astype(np.uint16)
+    return nearest_pixels(raw, size)
 
 
 def known_depth(raw: Shaped[np.ndarray, "h w"], scale: float, path: Path) -> Float[Tensor, "h w"]:

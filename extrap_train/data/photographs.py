@@ -13,10 +13,9 @@ from torch import Tensor
 
 from extrap_train.data.camera_check import PoseConvention, find_pose_fault, require_sound
 from extrap_train.data.depth_files import DepthFile
-from extrap_train.data.images import read_photograph
+from extrap_train.data.image_files import image_size, read_photograph, same_view
 from extrap_train.data.listed_files import PICTURE_SUFFIXES, ListedFiles
 from extrap_train.data.paths import require_file
-from extrap_train.data.picture_files import image_size, same_view
 from extrap_train.data.sequences import Frame, FrameSequence, PointCloud
 from extrap_train.errors import InputError
 from extrap_train.geometry.lens import Lens, undistort

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from extrap_train.data.frame_files import SequenceFrames
-from extrap_train.data.images import to_eight_bits
+from extrap_train.data.image_files import to_eight_bits
 from extrap_train.data.paths import file_stamp
 from extrap_train.data.sequences import Frame, FrameSequence
 from extrap_train.depth import DepthSource, NoDepthError

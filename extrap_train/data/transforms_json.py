@@ -11,6 +11,7 @@ from torch import Tensor
 
 from extrap_train.data.camera_check import OPENGL_POSES
 from extrap_train.data.depth_files import DepthFile
+from extrap_train.data.image_files import MAX_PIXELS, image_size
 from extrap_train.data.json_files import read_json, require_dict, require_list
 from extrap_train.data.lens_keys import LENS_KEYS, lens_of, merge_entry, number_of
 from extrap_train.data.listed_files import ListedFiles
@@ -21,7 +22,6 @@ from extrap_train.data.photographs import (
     pinhole_camera,
     sequence_of_photographs,
 )
-from extrap_train.data.picture_files import MAX_PIXELS, image_size
 from extrap_train.data.sequences import FrameSequence, PointCloud
 from extrap_train.errors import InputError
 from extrap_train.geometry.opengl import world_to_cam_from_opengl

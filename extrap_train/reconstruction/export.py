@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from plyfile import PlyData, PlyElement
 
-from extrap_train.data.images import to_eight_bits
+from extrap_train.data.image_files import to_eight_bits
 from extrap_train.geometry.colmap import colmap_from_world_to_cam
 from extrap_train.geometry.opengl import opengl_from_world_to_cam
 from extrap_train.geometry.world_frame import WorldFrame

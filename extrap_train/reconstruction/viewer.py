@@ -9,7 +9,7 @@ import numpy as np
 import roma
 from jaxtyping import Float
 
-from extrap_train.data.images import to_eight_bits
+from extrap_train.data.image_files import to_eight_bits
 from extrap_train.errors import InputError
 from extrap_train.reconstruction.cloud import PointCloud, cloud_of
 from extrap_train.reconstruction.global_map import GIVEN, GlobalMap, MapView

@@ -14,7 +14,7 @@ from benchmarks.report.aggregate import read_results
 from benchmarks.run.plan import TableFolder
 from benchmarks.run_table import RunOptions, run_table
 from extrap_train.config import CapturesConfig, RulesConfig
-from extrap_train.data.images import to_eight_bits
+from extrap_train.data.image_files import to_eight_bits
 from extrap_train.errors import InputError
 from extrap_train.geometry.opengl import opengl_from_world_to_cam
 from extrap_train.jobs.local import LocalLauncher

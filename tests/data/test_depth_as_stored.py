@@ -9,7 +9,7 @@ from complaints import complaint_about
 from PIL import Image
 
 from extrap_train.data.depth_files import read_depth, read_sixteen_bit
-from extrap_train.data.picture_files import same_view
+from extrap_train.data.image_files import same_view
 
 _RNG = np.random.default_rng(0)
 _DEPTH = _RNG.integers(1, 60_000, (6, 8)).astype(np.uint16)

@@ -17,8 +17,7 @@ from posed_folders import write_transforms
 from traced_scenes import SCENES, orbit_camera, render
 
 from extrap_train.data import estimated_poses
-from extrap_train.data.images import to_eight_bits
-from extrap_train.data.picture_files import upright_photograph
+from extrap_train.data.image_files import to_eight_bits, upright_photograph
 from extrap_train.data.scene_spec import open_scene
 from extrap_train.data.structure_from_motion import EXHAUSTIVE, NEIGHBOURS, pairs_to_match
 from extrap_train.errors import InputError

@@ -16,7 +16,7 @@ from extrap_train.data.frame_codec import (
     encode_depth,
     encode_image,
 )
-from extrap_train.data.images import to_eight_bits
+from extrap_train.data.image_files import to_eight_bits
 from extrap_train.data.square_frames import object_square
 
 KILOBYTE = 1000

@@ -21,12 +21,13 @@ import pytest
 from PIL import Image
 
 from benchmarks.protocol.array_files import array_of, pictures_of
-from extrap_train.data.depth_files import read_depth, read_depth_mask, read_sixteen_bit
-from extrap_train.data.images import (
+from extrap_train.data.depth_files import read_depth, read_sixteen_bit
+from extrap_train.data.image_files import (
+    image_size,
+    read_grey,
     read_mask,
     read_photograph,
 )
-from extrap_train.data.picture_files import image_size
 from extrap_train.errors import InputError
 
 SEED = 20
@@ -198,7 +199,7 @@ def _readings(path: Path) -> Iterator[Callable[[], object]]:
     yield lambda: read_photograph(path, of_its_size())
     yield lambda: read_photograph(path, SIZE, path)
     yield lambda: read_mask(path, SIZE)
-    yield lambda: read_depth_mask(path, of_its_size())
+    yield lambda: read_grey(path, of_its_size())
     yield lambda: read_sixteen_bit(path, of_its_size())
     yield lambda: read_depth(path, SIZE, 0.001)
     if path.is_file() and not path.is_symlink():

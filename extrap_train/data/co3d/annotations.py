@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from extrap_train.data.depth_files import DepthFile
+from extrap_train.data.image_files import MAX_PIXELS
 from extrap_train.data.json_files import read_json_list
 from extrap_train.data.paths import check_relative
-from extrap_train.data.picture_files import MAX_PIXELS
 from extrap_train.errors import InputError
 from extrap_train.geometry.pytorch3d import NDC_FORMATS
 

@@ -18,7 +18,7 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from extrap_train.data.co3d import FRAME_ANNOTATIONS, SEQUENCE_ANNOTATIONS
-from extrap_train.data.images import to_eight_bits
+from extrap_train.data.image_files import to_eight_bits
 from extrap_train.geometry.pytorch3d import viewpoint_from_camera
 from extrap_train.store.atomic import write_atomic
 from extrap_train.views import Camera, View
