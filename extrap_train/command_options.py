@@ -32,6 +32,7 @@ GROUPS: dict[str, list[type]] = {
     ],
     "launcher": [schema.LocalConfig, schema.SlurmConfig],
     "model": [schema.ModelConfig],
+    "logger": [schema.LoggerConfig],
 }
 """Variants of each group; one alone has files that differ in values only."""
 

@@ -43,6 +43,7 @@ _NOT_PART_OF_THE_RUN = (
     "run",
     "resume",
     "threads",
+    "logger",
     "validation",
     "trainer.steps",
     "trainer.gradient_checkpointing",

@@ -73,7 +73,7 @@ def own_choices(tmp_path: Path) -> Path:
         (["category=hydrant", "sampler.solver=unipc", "sampler.eta=1"], "need sampler.solver=ddim"),
         (["category=hydrant", "+trainer.logger=wandb"], "there is no option trainer.logger"),
         (["category=hydrant", "++trainer.wandb.project=x"], "no option trainer.wandb.project"),
-        (["category=hydrant", "+logger=wandb"], "there is no option logger"),
+        (["category=hydrant", "logger=wanbd"], "did you mean wandb?"),
         (["category=hydrant", "+experiments=paper"], "did you mean experiment?"),
         (["category=hydrant", "model.unet.channels=[1,2"], "model.unet.channels=[1,2: must be a"),
         (["category=hydrant", "trainer.steps=1 (x)"], "trainer.steps=1 (x): must be a whole numb"),

@@ -18,6 +18,7 @@ from extrap_train.config.commands import (
     DataPrepConfig,
     LauncherConfig,
     LocalConfig,
+    LoggerConfig,
     SlurmConfig,
     TrainConfig,
     TrainerConfig,

@@ -80,6 +80,17 @@ class TrainerConfig:
 
 
 @dataclass
+class LoggerConfig:
+    """Where a training is logged."""
+
+    name: str = option(
+        "tensorboard",
+        "where metrics, options and sample sheets go beside the run's folder; csv: nowhere else",
+        known=("csv", "mlflow", "tensorboard", "wandb"),
+    )
+
+
+@dataclass
 class ValidationConfig:
     """What the trained model is measured on: held-out sequences."""
 
@@ -158,6 +169,7 @@ class TrainConfig(SceneOptions):
     depth: DepthConfig = MISSING
     matcher: MatcherConfig = MISSING
     model: ModelConfig = MISSING
+    logger: LoggerConfig = field(default_factory=LoggerConfig)
     prep: PrepConfig = field(default_factory=PrepConfig)
     sampler: SamplerOptions = field(default_factory=SamplerOptions)
     trainer: TrainerConfig = field(default_factory=TrainerConfig)

@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import lightning
 import torch
-from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.loggers import Logger
 from rich.console import Console
 
 from extrap_train.config import TrainConfig, TrainerConfig, resolve_paths
@@ -48,6 +48,7 @@ from extrap_train.runs import (
 )
 from extrap_train.store import Outcome
 from extrap_train.store.manifest import REMEDY, Conflict, Manifest, claim
+from extrap_train.tasks.loggers import log_sheet, open_logger, require_logger
 from extrap_train.tasks.results import draw_curve, draw_views, print_places, write_results
 from extrap_train.tasks.training_data import Prepare, data_module, require_unseen
 from extrap_train.terminal import terminal
@@ -60,6 +61,7 @@ def run(config: TrainConfig, prepare: Prepare) -> Outcome:
     good.
     """
     require_accelerator(config.trainer.accelerator)
+    require_logger(config.logger.name)
     console = terminal(quiet=not is_first())
     quieten_lightning()
     distance, missing = lpips_or_reason(config.validation.lpips_weights)
@@ -78,7 +80,8 @@ def run(config: TrainConfig, prepare: Prepare) -> Outcome:
             console.print(f"already trained for {steps} steps: {folder.path}")
         else:
             training = CategoryTraining(model, config, data.validation_names(), distance)
-            _train(training, data, opening.checkpoint, folder, seconds)
+            with open_logger(config, folder) as loggers:
+                _train(training, data, opening.checkpoint, folder, seconds, loggers)
             if is_first():
                 save_model(training.model, folder.model)
                 draw_curve(folder)
@@ -138,12 +141,13 @@ def _train(
     checkpoint: str | None,
     folder: RunFolder,
     seconds: dict[str, float],
+    loggers: list[Logger],
 ) -> None:
     """Train and validate, and note how long both took."""
     started = time.perf_counter()
     every = data.batches_per_epoch
     kept = Checkpoints(folder.checkpoints, every)
-    trainer = _trainer(training.config, folder, checkpoint, kept)
+    trainer = _trainer(training.config, folder, checkpoint, kept, loggers)
     with (
         _ended_together(trainer),
         kept.stoppable(),
@@ -197,7 +201,9 @@ class _Pictures(lightning.Callback):
     ) -> None:
         assert isinstance(pl_module, CategoryTraining)
         if trainer.is_global_zero and not trainer.sanity_checking:
-            draw_views(pl_module.pictures(), self.folder / f"step-{trainer.global_step:08d}.png")
+            file = self.folder / f"step-{trainer.global_step:08d}.png"
+            draw_views(pl_module.pictures(), file)
+            log_sheet(trainer.loggers, file, trainer.global_step)
 
 
 def quiet_trainer(options: TrainerConfig, **more: Any) -> lightning.Trainer:
@@ -220,7 +226,11 @@ def quiet_trainer(options: TrainerConfig, **more: Any) -> lightning.Trainer:
 
 
 def _trainer(
-    config: TrainConfig, folder: RunFolder, checkpoint: str | None, kept: Checkpoints
+    config: TrainConfig,
+    folder: RunFolder,
+    checkpoint: str | None,
+    kept: Checkpoints,
+    loggers: list[Logger],
 ) -> lightning.Trainer:
     options = config.trainer
     resumed_step = _resumed_step(checkpoint)
@@ -233,10 +243,7 @@ def _trainer(
         reload_dataloaders_every_n_epochs=int(resumed_step % kept.every > 0),  # a short first epoch
         num_sanity_val_steps=0,
         use_distributed_sampler=False,
-        logger=[
-            MetricsTable(folder.path / "metrics.csv", resumed_step),
-            TensorBoardLogger(folder.path, name="", version="tensorboard"),
-        ],
+        logger=[MetricsTable(folder.path / "metrics.csv", resumed_step), *loggers],
         plugins=[WholeCheckpointIO()],
         callbacks=[
             *([AveragedWeights(options.ema_decay)] if options.ema_decay else []),
