@@ -2,13 +2,16 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
+from extrap_train.depth.plane_sweep_numba import correlation_cost_numba, mean_of_better_numba
 from extrap_train.geometry.cameras import pixel_grid
 from extrap_train.geometry.ncc import COLOUR_NOISE, box_mean
+from extrap_train.geometry.warp import needs_torch
 from extrap_train.views import Camera, View
 
 WINDOW = 5
@@ -79,9 +82,29 @@ class PhotoCost:
     def __call__(self, inverse_depth: Float[Tensor, "d h w"]) -> Float[Tensor, "d h w"]:
         """Cost in [0, 1] per hypothesis; 0.5, which says nothing, where no neighbour sees it."""
         size = max(1, CHUNK_ELEMENTS // (self.image.numel() * len(self.neighbours)))
-        return torch.cat([self._cost(chunk) for chunk in inverse_depth.split(size)])
+        cost = self.cost_torch if needs_torch(inverse_depth, self.image) else self._cost_numba
+        return torch.cat([cost(chunk) for chunk in inverse_depth.split(size)])
 
-    def _cost(self, inverse_depth: Float[Tensor, "d h w"]) -> Float[Tensor, "d h w"]:
+    def _cost_numba(self, inverse_depth: Float[Tensor, "d h w"]) -> Float[Tensor, "d h w"]:
+        costs = inverse_depth.new_empty(len(self.neighbours), *inverse_depth.shape)
+        view = [x.movedim(0, -1).contiguous().numpy() for x in (self.image, self.mean[0])]
+        for (projection, image), cost in zip(self.neighbours, costs, strict=True):
+            correlation_cost_numba(
+                inverse_depth.contiguous().numpy(),
+                projection.at_infinity.contiguous().numpy(),
+                projection.epipole.contiguous().numpy(),
+                image.movedim(0, -1).contiguous().numpy(),
+                *view,
+                self.variance[0].contiguous().numpy(),
+                (WINDOW // 2, np.float32(COLOUR_NOISE * len(image))),
+                cost.numpy(),
+            )
+        mean = torch.empty_like(costs[0])
+        mean_of_better_numba(costs.numpy(), mean.numpy())
+        return mean
+
+    def cost_torch(self, inverse_depth: Float[Tensor, "d h w"]) -> Float[Tensor, "d h w"]:
+        """The cost in torch, for GPUs: the definition, without chunks."""
         costs = torch.stack(
             [
                 self._against(projection, image, inverse_depth)

@@ -2,13 +2,17 @@
 
 import math
 from dataclasses import dataclass
+from itertools import product
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
 from extrap_train.depth.photo_cost import PhotoCost, projection_between
+from extrap_train.depth.plane_sweep_numba import add_paths_numba
+from extrap_train.geometry.warp import needs_torch
 from extrap_train.views import View
 
 COARSEST_STEP = 2.0
@@ -124,8 +128,25 @@ def semi_global_cost(
 ) -> Float[Tensor, "d h w"]:
     """Least cost of a path of hypotheses that ends in each pixel, mean of eight directions.
 
-    Semi-global matching (Hirschmüller, 2008), vectorised over scanlines.
+    Semi-global matching (Hirschmüller, 2008).
     """
+    if needs_torch(cost, image):
+        return semi_global_torch(cost, image)
+    planes_last = cost.permute(1, 2, 0).contiguous()
+    total = torch.zeros_like(planes_last)
+    for step in product((-1, 0, 1), repeat=2):
+        if step != (0, 0):
+            penalty = _jump_penalty(image, *step).contiguous().numpy()
+            add_paths_numba(
+                planes_last.numpy(), penalty, *step, np.float32(SMALL_STEP), total.numpy()
+            )
+    return total.permute(2, 0, 1) / 8
+
+
+def semi_global_torch(
+    cost: Float[Tensor, "d h w"], image: Float[Tensor, "3 h w"]
+) -> Float[Tensor, "d h w"]:
+    """`semi_global_cost` in torch, for GPUs: vectorised over scanlines."""
     rows = cost.permute(1, 2, 0)
     columns, image_columns = cost.permute(2, 1, 0), image.mT
     down = torch.stack([_both_ways(rows, image, shift) for shift in (-1, 0, 1)]).sum(0)
@@ -137,8 +158,8 @@ def _both_ways(
     cost: Float[Tensor, "n lanes d"], image: Float[Tensor, "3 n lanes"], shift: int
 ) -> Float[Tensor, "n lanes d"]:
     """Paths that step by (1, shift), and those that step by (−1, −shift), added."""
-    penalty = _jump_penalty(image, shift)
-    backward = _jump_penalty(image.flip(1, 2), shift)
+    penalty = _jump_penalty(image, 1, shift)[..., None]
+    backward = _jump_penalty(image.flip(1, 2), 1, shift)[..., None]
     costs = torch.stack([cost, cost.flip(0, 1)], 1)
     forward_sum, backward_sum = _scan(costs, torch.stack([penalty, backward], 1), shift).unbind(1)
     return forward_sum + backward_sum.flip(0, 1)
@@ -166,6 +187,9 @@ def _shift(path: Float[Tensor, "2 lanes d"], shift: int) -> Float[Tensor, "2 lan
     return functional.pad(path, (0, 0, 1, -1) if shift > 0 else (0, 0, -1, 1))
 
 
-def _jump_penalty(image: Float[Tensor, "3 n lanes"], shift: int) -> Float[Tensor, "n lanes 1"]:
-    contrast = (image - image.roll((1, shift), (1, 2))).abs().mean(0)
-    return (JUMP / (1 + contrast / EDGE_CONTRAST)).clamp_min(1.5 * SMALL_STEP)[..., None]
+def _jump_penalty(
+    image: Float[Tensor, "3 h w"], row_step: int, column_step: int
+) -> Float[Tensor, "h w"]:
+    """Of a path that comes to each pixel by this step."""
+    contrast = (image - image.roll((row_step, column_step), (1, 2))).abs().mean(0)
+    return (JUMP / (1 + contrast / EDGE_CONTRAST)).clamp_min(1.5 * SMALL_STEP)

@@ -1,3 +1,4 @@
+import pytest
 import torch
 from traced_scenes import SCENES, orbit_camera, render
 
@@ -36,6 +37,17 @@ def test_what_no_neighbour_sees_costs_neither_much_nor_little():
     torch.testing.assert_close(
         PhotoCost(view, neighbours)(hidden), torch.full((1, 96, 96), 0.5), atol=0, rtol=0
     )
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_the_kernel_and_torch_agree(count):
+    view, *neighbours = views_of_plane()
+    cost = PhotoCost(view, (2 * neighbours)[:count])
+    inverse_depth = torch.linspace(-0.1, 3.0, 9)[:, None, None].expand(9, 96, 96)
+    difference = (cost(inverse_depth) - cost.cost_torch(inverse_depth)).abs()
+    # Variances are differences of rounded moments: where there is little texture they are noise.
+    assert difference.mean() < 1e-4
+    assert (difference > 1e-2).float().mean() < 1e-3
 
 
 def test_chunks_do_not_change_the_cost(monkeypatch):

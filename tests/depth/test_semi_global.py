@@ -1,9 +1,16 @@
 import itertools
 
 import numpy as np
+import pytest
 import torch
 
-from extrap_train.depth.plane_sweep import EDGE_CONTRAST, JUMP, SMALL_STEP, semi_global_cost
+from extrap_train.depth.plane_sweep import (
+    EDGE_CONTRAST,
+    JUMP,
+    SMALL_STEP,
+    semi_global_cost,
+    semi_global_torch,
+)
 
 
 def pixel_by_pixel(cost: np.ndarray, image: np.ndarray) -> np.ndarray:
@@ -28,13 +35,14 @@ def pixel_by_pixel(cost: np.ndarray, image: np.ndarray) -> np.ndarray:
     return total / 8
 
 
-def test_equals_the_recursion_pixel_by_pixel():
+@pytest.mark.parametrize("summed", [semi_global_cost, semi_global_torch])
+def test_equals_the_recursion_pixel_by_pixel(summed):
     generator = torch.Generator().manual_seed(1)
     cost = torch.rand(5, 6, 7, generator=generator)
     image = torch.rand(3, 6, 7, generator=generator) * 0.2
     expected = pixel_by_pixel(cost.double().numpy(), image.double().numpy())
     torch.testing.assert_close(
-        semi_global_cost(cost, image), torch.from_numpy(expected).float(), atol=1e-5, rtol=0
+        summed(cost, image), torch.from_numpy(expected).float(), atol=1e-5, rtol=0
     )
 
 
