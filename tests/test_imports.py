@@ -115,6 +115,8 @@ def test_what_is_imported_is_declared() -> None:
         name
         for name in imported - ours - set(sys.stdlib_module_names)
         if not declared & {_normalised(d) for d in distributions.get(name, [name])}
+        # an extra that is not installed: mlflow is in mlflow-skinny
+        and not (name not in distributions and any(d.startswith(f"{name}-") for d in declared))
     }
     assert not undeclared
 
