@@ -21,9 +21,8 @@ from extrap_train.config import (
 )
 from extrap_train.data.co3d import read_category
 from extrap_train.data.json_files import read_json, require_list
-from extrap_train.data.photographs import CATEGORY as NO_CATEGORY
 from extrap_train.data.scene_spec import SYNTHETIC_SCHEME, open_scene
-from extrap_train.data.sequences import FrameSequence
+from extrap_train.data.sequences import NO_CATEGORY, FrameSequence
 from extrap_train.data.synthetic import build_scene, surface_points
 from extrap_train.data.synthetic.capture import synthetic_sequence
 from extrap_train.data.transforms_json import TRANSFORMS, read_transforms

@@ -14,9 +14,13 @@ from extrap_train.data.colmap_files import (
     read_model_images,
 )
 from extrap_train.data.image_files import MAX_PIXELS
-from extrap_train.data.listed_files import ListedFiles
+from extrap_train.data.listed_photographs import (
+    Listed,
+    ListedFiles,
+    ListedPhotograph,
+    sequence_of_photographs,
+)
 from extrap_train.data.paths import check_relative
-from extrap_train.data.photographs import Listed, Photograph, sequence_of_photographs
 from extrap_train.data.sequences import FrameSequence, PointCloud
 from extrap_train.errors import InputError
 from extrap_train.geometry.colmap import (
@@ -109,7 +113,7 @@ def _count_images(model: Path) -> int:
 
 def _photograph(
     entry: ModelImage, cameras: dict[int, ModelCamera], file: Path, upright: bool, path: str
-) -> Photograph:
+) -> ListedPhotograph:
     if entry.fault:
         raise InputError(f"{entry.name}: {entry.fault}")
     if entry.camera not in cameras:
@@ -120,7 +124,7 @@ def _photograph(
     camera = cameras[entry.camera]
     quaternion = torch.tensor(entry.quaternion_wxyz, dtype=torch.float64)
     translation = torch.tensor(entry.translation, dtype=torch.float64)
-    return Photograph(
+    return ListedPhotograph(
         image_path=path,
         height=camera.height,
         width=camera.width,

@@ -5,8 +5,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
+import torch
+from torch import Tensor
+
+from extrap_train.data.depth_files import DepthFile
+from extrap_train.data.image_files import read_photograph
 from extrap_train.data.paths import require_file
+from extrap_train.geometry.lens import Lens, undistort
 from extrap_train.views import Camera, View
+
+NO_CATEGORY = "scene"
+"""What stands for a category where a capture has none."""
 
 
 @runtime_checkable
@@ -36,6 +45,59 @@ class Frame:
     reading: str = ""
     """What else decides about what `load` returns, in words: the lens that it undoes, the unit of
     depth files."""
+
+
+@dataclass(frozen=True, slots=True)
+class Photograph:
+    """One photograph's files; a dataclass and no closure, so that it can be sent to workers."""
+
+    root: Path
+    name: str
+    camera: Camera
+    """Of the undistorted photograph."""
+    image_path: str
+    mask_path: str | None = None
+    depth: DepthFile | None = None
+    lens: Lens | None = None
+    """To be undone; None for a pinhole camera's photograph."""
+    upright: bool = False
+    """Whether the camera holds the photograph as its EXIF orientation turns it."""
+
+    def frame(self) -> Frame:
+        """The photograph as a frame that has not been read yet."""
+        parts = [str(self.lens)] if self.lens else []
+        parts.append(f"depth in {self.depth.scale if self.depth else None}")
+        parts += ["upright"] if self.upright else []
+        depth = (self.depth.path, self.depth.mask_path) if self.depth else ()
+        return Frame(
+            name=self.name,
+            camera=self.camera,
+            has_depth=self.depth is not None,
+            has_mask=self.mask_path is not None,
+            load=self.load,
+            files=tuple(self.root / p for p in (self.image_path, self.mask_path, *depth) if p),
+            reading=", ".join(parts),
+        )
+
+    def load(self, *, depth: bool = True) -> View:
+        """See `Load`."""
+        size = self.camera.height, self.camera.width
+        mask_path = self.root / self.mask_path if self.mask_path else None
+        image, mask = read_photograph(self.root / self.image_path, size, mask_path, self.upright)
+        found = self.depth.read(self.root, size) if depth and self.depth else None
+        return View(
+            image=self._straighten(image.permute(1, 2, 0)).permute(2, 0, 1).contiguous(),
+            camera=self.camera,
+            depth=None if found is None else self._straighten(found, nearest=True),
+            mask=None if mask is None else self._straighten(mask),
+            name=self.name,
+        )
+
+    def _straighten(self, picture: Tensor, nearest: bool = False) -> Tensor:
+        if self.lens is None:
+            return picture
+        pinhole = self.lens.pinhole(self.camera.height, self.camera.width)
+        return torch.from_numpy(undistort(picture.numpy(), self.lens, pinhole, nearest))
 
 
 @dataclass(frozen=True)

@@ -14,14 +14,14 @@ from extrap_train.data.depth_files import DepthFile
 from extrap_train.data.image_files import MAX_PIXELS, image_size
 from extrap_train.data.json_files import read_json, require_dict, require_list
 from extrap_train.data.lens_keys import LENS_KEYS, lens_of, merge_entry, number_of
-from extrap_train.data.listed_files import ListedFiles
-from extrap_train.data.paths import check_relative
-from extrap_train.data.photographs import (
+from extrap_train.data.listed_photographs import (
     Listed,
-    Photograph,
+    ListedFiles,
+    ListedPhotograph,
     pinhole_camera,
     sequence_of_photographs,
 )
+from extrap_train.data.paths import check_relative
 from extrap_train.data.sequences import FrameSequence, PointCloud
 from extrap_train.errors import InputError
 from extrap_train.geometry.opengl import world_to_cam_from_opengl
@@ -84,7 +84,7 @@ def read_cameras(file: Path) -> tuple[list[str], Camera]:
             raise InputError(f"{file}: neither the file nor its entry {name} has w and h; add them")
         names.append(name)
         photo = _photograph(ListedFiles(file.parent), entry, file, name)
-        cameras.append(pinhole_camera(photo, file)[1])
+        cameras.append(pinhole_camera(photo, file))
     sizes = {(camera.height, camera.width) for camera in cameras}
     if len(sizes) != 1:
         raise InputError(f"{file}: its entries have different sizes {sorted(sizes)}; split it")
@@ -112,11 +112,13 @@ def _listed_picture(
     return Listed(check_relative(path, file), partial(_photograph, files, merged, file))
 
 
-def _photograph(files: ListedFiles, entry: dict[str, Any], file: Path, path: str) -> Photograph:
+def _photograph(
+    files: ListedFiles, entry: dict[str, Any], file: Path, path: str
+) -> ListedPhotograph:
     try:
         height, width = _size(files.root / path, entry)
         mask = entry.get("mask_path")
-        return Photograph(
+        return ListedPhotograph(
             image_path=path,
             height=height,
             width=width,

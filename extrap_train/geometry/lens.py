@@ -1,6 +1,7 @@
 """Lenses that bend straight lines, and the pinhole camera that is left when that is undone."""
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -52,6 +53,7 @@ class Lens:
             cy=self.cy * scale_y,
         )
 
+    @lru_cache(maxsize=1024)  # all frames of a capture ask the same
     def pinhole(self, height: int, width: int) -> "Lens":
         """The lens of the undistorted picture: zoomed in just until no pixel of it is empty.
 

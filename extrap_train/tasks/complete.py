@@ -18,9 +18,8 @@ from extrap_train.config import (
     TrainConfig,
     dotted,
 )
-from extrap_train.data.photographs import CATEGORY
 from extrap_train.data.scene_spec import SYNTHETIC_SCHEME, open_scene
-from extrap_train.data.sequences import Frame, FrameSequence
+from extrap_train.data.sequences import NO_CATEGORY, Frame, FrameSequence
 from extrap_train.data.square_frames import load_readable, require_few_unusable
 from extrap_train.data.synthetic import SyntheticScene, build_scene
 from extrap_train.depth.sources import depth_source
@@ -172,7 +171,7 @@ def _readable(config: TrainConfig, sequence: FrameSequence, inputs: list[int]) -
 def _check_category(config: TrainConfig, sequence: FrameSequence) -> None:
     """A model does not generate views of another category unasked."""
     own, chosen = sequence.category, config.category.name
-    if own in (CATEGORY, chosen):
+    if own in (NO_CATEGORY, chosen):
         return
     if config.weights is None and config.complete.generator == "model":
         raise InputError(

@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from extrap_train.config import SyntheticConfig, TrainConfig, dotted
-from extrap_train.data.photographs import CATEGORY
 from extrap_train.data.scene_spec import SYNTHETIC_SCHEME, open_scene, scene_address
 from extrap_train.data.scene_views import input_views, select_input_frames
-from extrap_train.data.sequences import Frame, FrameSequence
+from extrap_train.data.sequences import NO_CATEGORY, Frame, FrameSequence
 from extrap_train.depth.sources import depth_source, weight_files
 from extrap_train.errors import InputError
 from extrap_train.runs import given_name, short_name
@@ -51,7 +50,7 @@ def open_sequence(config: TrainConfig) -> FrameSequence:
 
 def label_of(sequence: FrameSequence) -> str:
     """The scene's name in a path."""
-    if sequence.category == CATEGORY:
+    if sequence.category == NO_CATEGORY:
         return sequence.name
     return f"{sequence.category}-{sequence.name}"
 

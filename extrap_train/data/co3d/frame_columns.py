@@ -16,8 +16,7 @@ from extrap_train.data.camera_check import degenerate_camera, fits_photograph
 from extrap_train.data.co3d.annotations import VIEWPOINT, FrameAnnotation
 from extrap_train.data.depth_files import DepthFile
 from extrap_train.data.paths import file_stamp
-from extrap_train.data.photographs import PhotographLoader
-from extrap_train.data.sequences import Frame
+from extrap_train.data.sequences import Frame, Photograph
 from extrap_train.geometry.pytorch3d import NdcFormat, Viewpoint, camera_from_viewpoint
 from extrap_train.views import Camera
 
@@ -115,7 +114,7 @@ class Co3dFrames(Sequence[Frame]):
             os.fsdecode(row[f"{kind}_path"]) for kind in ("image", "mask", "depth", "depth_mask")
         )
         scale = float(row["depth_scale"])
-        return PhotographLoader(
+        return Photograph(
             root=self.root,
             name=image.rpartition("/")[2],
             camera=camera,

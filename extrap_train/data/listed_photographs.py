@@ -1,9 +1,15 @@
-"""Posed photographs in a folder, whatever lists them: paths, lenses and poses to a sequence."""
+"""Photographs that a description lists with their cameras, whatever its format: from the paths as
+they stand there to a sequence.
+"""
 
+import difflib
 import logging
+import os
 import posixpath
-from collections.abc import Callable, Sequence
+import unicodedata
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -13,83 +19,86 @@ from torch import Tensor
 
 from extrap_train.data.camera_check import PoseConvention, find_pose_fault, require_sound
 from extrap_train.data.depth_files import DepthFile
-from extrap_train.data.image_files import image_size, read_photograph, same_view
-from extrap_train.data.listed_files import PICTURE_SUFFIXES, ListedFiles
-from extrap_train.data.paths import require_file
-from extrap_train.data.sequences import Frame, FrameSequence, PointCloud
+from extrap_train.data.image_files import image_size, same_view
+from extrap_train.data.sequences import NO_CATEGORY, FrameSequence, Photograph, PointCloud
 from extrap_train.errors import InputError
-from extrap_train.geometry.lens import Lens, undistort
-from extrap_train.views import Camera, View, stack_poses
+from extrap_train.geometry.lens import Lens
+from extrap_train.views import Camera, stack_poses
 
-
-@dataclass(frozen=True, slots=True)
-class PhotographLoader:
-    """One photograph's files; a dataclass and no closure, so that it can be sent to workers."""
-
-    root: Path
-    name: str
-    camera: Camera
-    """Of the undistorted photograph."""
-    image_path: str
-    mask_path: str | None = None
-    depth: DepthFile | None = None
-    lens: Lens | None = None
-    """To be undone; None for a pinhole camera's photograph."""
-    pinhole: Lens | None = None
-    """That of `camera`, where there is a lens to undo."""
-    upright: bool = False
-    """Whether the camera holds the photograph as its EXIF orientation turns it."""
-
-    def frame(self) -> Frame:
-        """The photograph as a frame that has not been read yet."""
-        parts = [str(self.lens)] if self.lens else []
-        parts.append(f"depth in {self.depth.scale if self.depth else None}")
-        parts += ["upright"] if self.upright else []
-        return Frame(
-            name=self.name,
-            camera=self.camera,
-            has_depth=self.depth is not None,
-            has_mask=self.mask_path is not None,
-            load=self.load,
-            files=self._files(),
-            reading=", ".join(parts),
-        )
-
-    def load(self, *, depth: bool = True) -> View:
-        """See `sequences.Load`."""
-        size = self.camera.height, self.camera.width
-        image_path = require_file(self.root / self.image_path)
-        mask_path = require_file(self.root / self.mask_path) if self.mask_path else None
-        image, mask = read_photograph(image_path, size, mask_path, self.upright)
-        found = self.depth.read(self.root, size) if depth and self.depth else None
-        return View(
-            image=self._straighten(image.permute(1, 2, 0)).permute(2, 0, 1).contiguous(),
-            camera=self.camera,
-            depth=None if found is None else self._straighten(found, nearest=True),
-            mask=None if mask is None else self._straighten(mask),
-            name=self.name,
-        )
-
-    def _files(self) -> tuple[Path, ...]:
-        depth = (self.depth.path, self.depth.mask_path) if self.depth else ()
-        return tuple(self.root / p for p in (self.image_path, self.mask_path, *depth) if p)
-
-    def _straighten(self, picture: Tensor, nearest: bool = False) -> Tensor:
-        if self.lens is None or self.pinhole is None:
-            return picture
-        return torch.from_numpy(undistort(picture.numpy(), self.lens, self.pinhole, nearest))
-
-
-CATEGORY = "scene"
-"""What stands for a category where a capture has none."""
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+"""Tried, in this order, where a name has none."""
+_MOST_COMPARED = 2000
+"""Names of a folder that a missing one is compared with."""
 MAX_FRAMES = 100_000
 """Of a capture; more are no capture of one scene."""
 
 log = logging.getLogger(__name__)
 
 
+class ListedFiles:
+    """The files below one folder, by the paths that a description gives them.
+
+    Paths have passed `check_relative`. A folder is listed once, and only where a file is missing.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self._folders: dict[str, dict[str, list[str]]] = {}
+
+    def find(self, listed: str, suffixes: Sequence[str] = ()) -> str | None:
+        """The path below the root that `listed` means, None where there is no such file.
+
+        Tried in turn: the path itself; `\\` as a stroke; with one of the `suffixes` added; and each
+        of these in another case or Unicode form, where only one file is called so.
+        """
+        spellings = [listed, listed.replace("\\", "/")] if "\\" in listed else [listed]
+        candidates = [
+            posixpath.normpath(spelling) + suffix
+            for spelling in spellings
+            for suffix in ("", *suffixes)
+        ]
+        if _is_file(self.root / candidates[0]):
+            return candidates[0]
+        alike = [(posixpath.split(path), self._alike(path)) for path in candidates]
+        exact = [posixpath.join(*path) for path, names in alike if path[1] in names]
+        other = [posixpath.join(path[0], names[0]) for path, names in alike if len(names) == 1]
+        there = (path for path in (*exact, *other) if _is_file(self.root / path))
+        return next(there, None)
+
+    def explain(self, listed: str) -> str:
+        """What is there instead of a file that was not found."""
+        path = _normal(listed)
+        if os.path.lexists(self.root / path):
+            return f"{path} is no regular file"
+        folder, name = posixpath.split(path)
+        looked_in = {folder: None, "": None, "images": None}
+        for place in looked_in:
+            alike = _look_alike(name, self._in(place).values())
+            if alike is not None:
+                return f"there is no {path}; there is {posixpath.join(place, alike)}"
+        if folder and not (self.root / folder).is_dir():
+            return f"there is no folder {folder}"
+        return f"there is no {path}"
+
+    def _alike(self, path: str) -> list[str]:
+        """The names in the path's folder that are its own but for case and Unicode form."""
+        folder, name = posixpath.split(path)
+        return self._in(folder).get(_folded(name), [])
+
+    def _in(self, folder: str) -> dict[str, list[str]]:
+        """The names in a folder, by their folded form."""
+        if folder not in self._folders:
+            names = self._folders.setdefault(folder, {})
+            try:
+                for path in sorted((self.root / folder).iterdir()):
+                    names.setdefault(_folded(path.name), []).append(path.name)
+            except OSError:
+                pass  # nothing is in a folder that is not there
+        return self._folders[folder]
+
+
 @dataclass(frozen=True)
-class Photograph:
+class ListedPhotograph:
     """What a description says of one picture; paths are relative to the capture's folder."""
 
     image_path: str
@@ -108,7 +117,7 @@ class Listed:
 
     path: str
     """Of its picture, as it stands there; it has passed `check_relative`."""
-    describe: Callable[[str], Photograph]
+    describe: Callable[[str], ListedPhotograph]
     """The photograph, by the path at which the picture was found; InputError where the entry cannot
     be used."""
 
@@ -141,7 +150,18 @@ def sequence_of_photographs(
         try:
             annotated = _describe(path, entries, description)
             photo = _at_its_size(files.root, annotated)
-            frames.append(_frame(files.root, photo, frame_name, description))
+            frames.append(
+                Photograph(
+                    root=files.root,
+                    name=frame_name,
+                    camera=pinhole_camera(photo, description),
+                    image_path=photo.image_path,
+                    mask_path=photo.mask_path,
+                    depth=photo.depth,
+                    lens=None if photo.lens.is_pinhole else photo.lens,
+                    upright=photo.upright,
+                ).frame()
+            )
         except InputError as error:
             left_out.append(str(error))
             continue
@@ -157,7 +177,7 @@ def sequence_of_photographs(
     if fault := find_pose_fault(stack_poses([frame.camera for frame in frames]), convention):
         raise InputError(f"{description}: {fault}")
     return FrameSequence(
-        CATEGORY,
+        NO_CATEGORY,
         name,
         tuple(frames),
         left_out=tuple(left_out),
@@ -197,7 +217,7 @@ def _find_pictures(
     return sorted(entries.items())
 
 
-def _describe(path: str, entries: Sequence[Listed], description: Path) -> Photograph:
+def _describe(path: str, entries: Sequence[Listed], description: Path) -> ListedPhotograph:
     """The photograph that all entries of one picture describe; InputError where they disagree."""
     first, *others = [entry.describe(path) for entry in entries]
     for other in others:
@@ -231,7 +251,7 @@ def _frame_names(paths: Sequence[str]) -> list[str]:
     return names
 
 
-def _at_its_size(root: Path, photo: Photograph) -> Photograph:
+def _at_its_size(root: Path, photo: ListedPhotograph) -> ListedPhotograph:
     """The photograph at its picture's size, where that is another size of the same view."""
     size = photo.height, photo.width
     try:
@@ -244,22 +264,7 @@ def _at_its_size(root: Path, photo: Photograph) -> Photograph:
     return replace(photo, height=height, width=width, lens=lens)
 
 
-def _frame(root: Path, photo: Photograph, name: str, description: Path) -> Frame:
-    pinhole, camera = pinhole_camera(photo, description)
-    return PhotographLoader(
-        root=root,
-        name=name,
-        camera=camera,
-        image_path=photo.image_path,
-        mask_path=photo.mask_path,
-        depth=photo.depth,
-        lens=None if photo.lens.is_pinhole else photo.lens,
-        pinhole=pinhole,
-        upright=photo.upright,
-    ).frame()
-
-
-def pinhole_camera(photo: Photograph, description: Path) -> tuple[Lens, Camera]:
+def pinhole_camera(photo: ListedPhotograph, description: Path) -> Camera:
     """The camera of a photograph once its lens is undone; InputError where it cannot be used."""
     lens = photo.lens
     if not all(np.isfinite([*lens.matrix.flat, *lens.distortion, lens.radial_r8])):
@@ -273,13 +278,34 @@ def pinhole_camera(photo: Photograph, description: Path) -> tuple[Lens, Camera]:
         raise InputError(
             f"{description}: {photo.image_path}: {error}; correct the lens or undistort beforehand"
         ) from None
-    return pinhole, _camera(photo, pinhole)
+    return _camera(photo, pinhole)
 
 
-def _camera(photo: Photograph, pinhole: Lens) -> Camera:
+def _camera(photo: ListedPhotograph, pinhole: Lens) -> Camera:
     return Camera(
         photo.world_to_cam.float(),
         torch.from_numpy(pinhole.matrix).float(),
         photo.height,
         photo.width,
     )
+
+
+def _folded(name: str) -> str:
+    """The same for names that differ in case or in how accents are composed."""
+    return unicodedata.normalize("NFC", name).casefold()
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # longer than any path
+        return False
+
+
+def _look_alike(name: str, names: Iterable[Sequence[str]]) -> str | None:
+    """A name of the same stem, else one that differs in little."""
+    few = [other for alike in islice(names, _MOST_COMPARED) for other in alike]
+    stem = posixpath.splitext(name)[0].casefold()
+    same = [other for other in few if posixpath.splitext(other)[0].casefold() == stem]
+    near = same or difflib.get_close_matches(name, few, n=1, cutoff=0.8)
+    return near[0] if near else None
