@@ -13,8 +13,8 @@ from torch.nn import functional
 from data_prep.category_pairs import prepare_category
 from extrap_train.config import DatasetDepthConfig, FlowMatcherConfig, PrepConfig, SyntheticConfig
 from extrap_train.data.co3d import read_category
+from extrap_train.data.examples import ExampleReader, linspace_indices
 from extrap_train.data.module import ValidationBatches
-from extrap_train.data.pair_examples import ExampleReader, linspace_indices
 from extrap_train.data.square_frames import object_square
 from extrap_train.diffusion.baselines import mean_filled_warp
 from extrap_train.geometry.warp import compute_warp

@@ -20,8 +20,8 @@ from benchmarks.protocol.prepared_scene import (
     SceneRecord,
 )
 from extrap_train.config import DatasetDepthConfig, DepthConfig, RulesConfig
+from extrap_train.data.examples import query_batch
 from extrap_train.data.image_files import to_eight_bits
-from extrap_train.data.queries import query_batch
 from extrap_train.depth import NoDepthError
 from extrap_train.depth.sources import depth_source
 from extrap_train.errors import InputError

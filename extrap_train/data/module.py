@@ -7,7 +7,7 @@ import numpy as np
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from extrap_train.config import TrainConfig
-from extrap_train.data.pair_examples import Example, ExampleReader, linspace_indices, mirror
+from extrap_train.data.examples import Example, ExampleReader, linspace_indices, mirror
 from extrap_train.geometry.warp import compute_warp
 from extrap_train.views import PackedBatch, PairBatch
 

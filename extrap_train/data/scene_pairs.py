@@ -9,8 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from extrap_train.data.pair_examples import Example, collate
-from extrap_train.data.queries import query_batch
+from extrap_train.data.examples import Example, collate, query_batch
 from extrap_train.depth import require_depth
 from extrap_train.errors import InputError
 from extrap_train.geometry.fill import fill_holes

@@ -1,4 +1,6 @@
-"""From one capture's photographs to square frames with depth, at the store's size."""
+"""From one capture's photographs to square frames with depth: what is stored, and what a scene's
+model starts from.
+"""
 
 import hashlib
 import json
@@ -8,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from extrap_train.data.frame_files import SequenceFrames
@@ -16,8 +18,9 @@ from extrap_train.data.image_files import to_eight_bits
 from extrap_train.data.paths import file_stamp
 from extrap_train.data.sequences import Frame, FrameSequence
 from extrap_train.depth import DepthSource, NoDepthError
-from extrap_train.errors import InputError
-from extrap_train.views import View, stack_cameras
+from extrap_train.errors import InputError, did_you_mean
+from extrap_train.geometry.viewpoints import camera_centers, farthest_point_sample
+from extrap_train.views import View, stack_cameras, stack_poses
 
 HELD_OUT_EVERY = 5
 """A lone sequence holds out every fifth frame."""
@@ -107,6 +110,64 @@ def make_frames(
     return frames
 
 
+def select_input_frames(
+    sequence: FrameSequence, names: Sequence[str], count: int | None
+) -> list[int]:
+    """Indices of a scene's input frames, in their order.
+
+    The frames that are named; else `count` spread by farthest point sampling of the positions; else
+    all. Raises InputError where there are fewer.
+    """
+    known = [frame.name for frame in sequence.frames]
+    where = f"scene {sequence.category}/{sequence.name}"
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise InputError(f"{where}: has no frame {unknown[0]}; {did_you_mean(unknown[0], known)}")
+    if names:
+        return sorted({known.index(name) for name in names})
+    if count is None:
+        return list(range(len(known)))
+    if count > len(known):
+        raise InputError(f"{where}: has {len(known)} frames, fewer than the {count} asked for")
+    cameras = stack_poses([frame.camera for frame in sequence.frames])
+    return sorted(farthest_point_sample(camera_centers(cameras), count).tolist())
+
+
+def input_views(
+    sequence: FrameSequence, chosen: Sequence[int], source: DepthSource, size: int
+) -> list[View]:
+    """The chosen frames as preparation makes them, `size` pixels square, with depth.
+
+    Depth is estimated from these frames alone, so that the others can serve as truth.
+    """
+    chosen_frames = tuple(sequence.frames[index] for index in chosen)
+    part = replace(sequence, frames=chosen_frames, left_out=())
+    frames = make_frames(part, source, size, lone=False)
+    return [
+        View(
+            _unit(frames.images[i]).permute(2, 0, 1).contiguous(),
+            frames.camera[i],
+            torch.from_numpy(frames.depths[i]),
+            _unit(frames.masks[i]),
+            name,
+        )
+        for i, name in enumerate(frames.names)
+    ]
+
+
+def target_views(frames: Sequence[Frame], size: int) -> list[View]:
+    """Frames framed in the same way, without depth: what a generated view is compared with."""
+    return [object_square(view, size) for view in load_held_out(frames)]
+
+
+def load_held_out(frames: Sequence[Frame]) -> Iterator[View]:
+    """The photographs without depth; those that cannot be read are left out with a warning."""
+    reasons: list[str] = []
+    yield from load_readable(frames, reasons, depth=False)
+    if reasons:
+        LOG.warning("%d held-out photographs are left out: %s", len(reasons), reasons[0])
+
+
 def _remedy(source: DepthSource) -> str:
     """For a sequence without any depth: only depth that comes with the data can be estimated."""
     if source.image_size is None:
@@ -183,3 +244,7 @@ def block_median(depth: Float[Tensor, "h w"], side: int) -> Float[Tensor, "h2 w2
     known = blocks.isfinite() & (blocks > 0)
     median = torch.where(known, blocks, torch.nan).nanmedian(-1).values
     return torch.where(known.float().mean(-1) >= LEAST_KNOWN_SHARE, median, 0)
+
+
+def _unit(pixels: UInt8[np.ndarray, "..."]) -> Float[Tensor, "..."]:
+    return torch.from_numpy(pixels).float().div_(255)

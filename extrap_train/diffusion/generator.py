@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrap_train.config import SamplerConfig
-from extrap_train.data.queries import query_batch
+from extrap_train.data.examples import query_batch
 from extrap_train.device import autocast
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sample_views

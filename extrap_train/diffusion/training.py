@@ -11,8 +11,8 @@ from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 
 from extrap_train.config import TrainConfig, TrainerConfig, sampler_for
+from extrap_train.data.examples import linspace_indices
 from extrap_train.data.module import shard
-from extrap_train.data.pair_examples import linspace_indices
 from extrap_train.diffusion.callbacks import ABOVE_BASELINES
 from extrap_train.diffusion.evaluation import (
     Prediction,

@@ -53,7 +53,7 @@ class Lens:
             cy=self.cy * scale_y,
         )
 
-    @lru_cache(maxsize=1024)  # all frames of a capture ask the same
+    @lru_cache(maxsize=1024)  # noqa: B019  # all frames of a capture ask the same
     def pinhole(self, height: int, width: int) -> "Lens":
         """The lens of the undistorted picture: zoomed in just until no pixel of it is empty.
 

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrap_train.data.queries import query_batch
+from extrap_train.data.examples import query_batch
 from extrap_train.data.synthetic import SyntheticScene, render, trace
 from extrap_train.depth import DepthMap, PointMaps, point_maps_of
 from extrap_train.diffusion.generator import GeneratedViews

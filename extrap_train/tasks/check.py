@@ -1,8 +1,7 @@
 """`task=check`: one picture that proves a scene's poses, scale, lens and masks, or shows faults."""
 
 from extrap_train.config import TrainConfig
-from extrap_train.data.scene_views import select_input_frames
-from extrap_train.data.square_frames import load_readable
+from extrap_train.data.square_frames import load_readable, select_input_frames
 from extrap_train.errors import InputError
 from extrap_train.reconstruction.capture_check import check_capture
 from extrap_train.reconstruction.check_picture import draw_check

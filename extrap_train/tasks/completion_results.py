@@ -12,8 +12,8 @@ from rich.console import Console
 from rich.table import Table
 
 from extrap_train.config import TrainConfig
-from extrap_train.data.scene_views import load_held_out
 from extrap_train.data.sequences import Frame, FrameSequence
+from extrap_train.data.square_frames import load_held_out
 from extrap_train.data.synthetic import SyntheticScene
 from extrap_train.gaussians.fit import Diverged
 from extrap_train.geometry.world_frame import WorldFrame

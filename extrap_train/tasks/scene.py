@@ -10,11 +10,11 @@ from lightning.fabric import Fabric
 from rich.console import Console
 
 from extrap_train.config import TrainConfig, dotted, sampler_for
-from extrap_train.data.pair_examples import linspace_indices
+from extrap_train.data.examples import linspace_indices
 from extrap_train.data.scene_pairs import AdaptationPairs, adaptation_pairs
 from extrap_train.data.scene_spec import scene_address
-from extrap_train.data.scene_views import target_views
 from extrap_train.data.sequences import Frame, FrameSequence
+from extrap_train.data.square_frames import target_views
 from extrap_train.device import advise_on_adapting_memory, trainer_precision
 from extrap_train.diffusion.adaptation import Adaptation, adapt
 from extrap_train.diffusion.evaluation import score_images, summarise

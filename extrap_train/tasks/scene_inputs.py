@@ -11,8 +11,8 @@ from typing import Any
 
 from extrap_train.config import SyntheticConfig, TrainConfig, dotted
 from extrap_train.data.scene_spec import SYNTHETIC_SCHEME, open_scene, scene_address
-from extrap_train.data.scene_views import input_views, select_input_frames
 from extrap_train.data.sequences import NO_CATEGORY, Frame, FrameSequence
+from extrap_train.data.square_frames import input_views, select_input_frames
 from extrap_train.depth.sources import depth_source, weight_files
 from extrap_train.errors import InputError
 from extrap_train.runs import given_name, short_name

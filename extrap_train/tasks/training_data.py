@@ -3,8 +3,8 @@
 from collections.abc import Callable
 
 from extrap_train.config import TrainConfig
+from extrap_train.data.examples import ExampleReader
 from extrap_train.data.module import PairModule
-from extrap_train.data.pair_examples import ExampleReader
 from extrap_train.data.prepared import PreparedData
 from extrap_train.diffusion.model_files import ancestors
 from extrap_train.errors import InputError

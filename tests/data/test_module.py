@@ -7,8 +7,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from extrap_train.data.examples import Example, collate, linspace_indices, mirror, pack
 from extrap_train.data.module import PositionSampler
-from extrap_train.data.pair_examples import Example, collate, linspace_indices, mirror, pack
 from extrap_train.geometry.warp import compute_warp
 from extrap_train.views import Camera, PairBatch
 

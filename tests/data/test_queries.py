@@ -7,7 +7,7 @@ import pytest
 import torch
 from orbits import even, looking_at, ring
 
-from extrap_train.data.queries import query_batch
+from extrap_train.data.examples import query_batch
 from extrap_train.errors import InputError
 from extrap_train.geometry.viewpoints import references_by_nearness
 from extrap_train.views import Camera, View

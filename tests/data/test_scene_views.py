@@ -5,7 +5,7 @@ import pytest
 import torch
 from orbits import capture, even, ring
 
-from extrap_train.data.scene_views import (
+from extrap_train.data.square_frames import (
     input_views,
     select_input_frames,
     target_views,

@@ -19,8 +19,8 @@ from data_prep.synthesize import synthesize
 from extrap_train.cli import register_schemas, typed_config
 from extrap_train.config import FlowMatcherConfig, SyntheticConfig, TrainConfig
 from extrap_train.data.co3d import read_category
+from extrap_train.data.examples import ExampleReader
 from extrap_train.data.module import PairModule
-from extrap_train.data.pair_examples import ExampleReader
 from extrap_train.data.prepared import PreparedData
 from extrap_train.depth import DepthMap
 from extrap_train.depth.dataset import DatasetDepth

@@ -16,8 +16,8 @@ from torch import Tensor
 from benchmarks.perf import diffusion_case
 from benchmarks.perf.warp_timing import bumpy_views, orbit_camera
 from extrap_train.config import ModelConfig, SamplerConfig, UNetConfig
+from extrap_train.data.examples import Example, collate, pack
 from extrap_train.data.frame_files import SealedTable, SequenceFrames, StoredFrames, write_frames
-from extrap_train.data.pair_examples import Example, collate, pack
 from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sample_views

@@ -8,7 +8,7 @@ import scenes
 import torch
 
 from extrap_train.config import CompletionConfig, ConfidenceConfig
-from extrap_train.data.queries import query_batch
+from extrap_train.data.examples import query_batch
 from extrap_train.depth import RELIABLE_CONFIDENCE, DepthMap, PointMaps, point_maps_of
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.diffusion.generator import GeneratedViews

@@ -1,4 +1,4 @@
-"""One training example: a query frame and its references, read from prepared data."""
+"""A query view and its references: read from prepared data, or posed views and a new camera."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,9 +10,22 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
+from extrap_train.data.camera_check import is_degenerate
 from extrap_train.data.prepared import PreparedData
-from extrap_train.geometry.viewpoints import extra_references, pairwise_angles, scene_center
-from extrap_train.views import Camera, PackedBatch, PairBatch, ViewPair, stack_cameras
+from extrap_train.depth import require_depth
+from extrap_train.errors import InputError
+from extrap_train.geometry.viewpoints import (
+    extra_references,
+    pairwise_angles,
+    references_by_nearness,
+    scene_center,
+)
+from extrap_train.views import Camera, PackedBatch, PairBatch, View, ViewPair, stack_cameras
+
+_DEGENERATE = (
+    "its camera is degenerate (NaN, no rotation, or a focal length that is not positive); correct "
+    "the pose"
+)
 
 
 @dataclass(frozen=True)
@@ -106,6 +119,39 @@ def _flows(
         return None
     none = torch.zeros(len(chosen[0][1]), *known[0].shape[1:])
     return torch.stack([none if flows is None else flows[order] for flows, order in chosen])
+
+
+def query_batch(
+    references: Sequence[View], queries: Camera, most_references: int, size: int
+) -> tuple[PairBatch, list[tuple[int, ...]]]:
+    """The batch of some queries (batched once), each with its nearest views as references.
+
+    Views and cameras are cropped to centred squares of `size` pixels. The batch's `image`, the
+    truth, is NaN; beside it, the indices of every query's references, nearest first. Raises
+    InputError where a pose is degenerate or a view has no depth.
+    """
+    if not references:
+        raise InputError("there is no view to start from; give at least one posed photograph")
+    for view in references:
+        if is_degenerate(view.camera):
+            raise InputError(f"view {view.name}: {_DEGENERATE}")
+    for index in is_degenerate(queries).nonzero().flatten().tolist():
+        raise InputError(f"query {index}: {_DEGENERATE}")
+    squares = [
+        view if (view.camera.height, view.camera.width) == (size, size) else view.squared(size)
+        for view in references
+    ]
+    cameras = stack_cameras([view.camera for view in squares])
+    order = references_by_nearness(cameras, queries)[:, :most_references]
+    images = torch.stack([view.image for view in squares])
+    depths = torch.stack([require_depth(view) for view in squares])
+    square_queries = queries.squared(size)
+    unknown = torch.full((3, size, size), torch.nan)
+    examples = [
+        Example(unknown, square_queries[i], images[chosen], cameras[chosen], depths[chosen])
+        for i, chosen in enumerate(torch.from_numpy(order))
+    ]
+    return collate(examples, most_references), [tuple(row) for row in order.tolist()]
 
 
 def read_example(data: PreparedData, pair: ViewPair, is_corrected: bool) -> Example:
