@@ -21,8 +21,7 @@ import torch
 from PIL import Image
 
 from extrap_train.data.camera_check import LONGEST_FOCAL, SHORTEST_FOCAL
-from extrap_train.data.colmap_files import read_model_cameras
-from extrap_train.data.colmap_model import read_model
+from extrap_train.data.colmap import read_model, read_model_cameras
 from extrap_train.data.image_files import read_photograph, to_eight_bits, upright_photograph
 from extrap_train.data.listed_photographs import PICTURE_SUFFIXES
 from extrap_train.data.paths import require_file

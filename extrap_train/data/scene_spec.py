@@ -5,7 +5,7 @@ from pathlib import Path
 from extrap_train.config import SyntheticConfig
 from extrap_train.data.camera_check import CO3D_POSES, find_pose_fault
 from extrap_train.data.co3d import FRAME_ANNOTATIONS, read_sequence
-from extrap_train.data.colmap_model import find_model, read_model
+from extrap_train.data.colmap import find_model, read_model
 from extrap_train.data.estimated_poses import find_pictures, read_unposed
 from extrap_train.data.sequences import FrameSequence
 from extrap_train.data.synthetic.capture import synthetic_sequence

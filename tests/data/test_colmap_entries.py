@@ -5,7 +5,7 @@ from captures import view_at
 from PIL import Image
 from test_colmap_model import Entry, write_binary, write_text
 
-from extrap_train.data.colmap_model import read_model
+from extrap_train.data.colmap import read_model
 from extrap_train.errors import InputError
 
 _NAMES = ["00.png", "20.png", "40.png", "60.png"]
