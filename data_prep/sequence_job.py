@@ -160,7 +160,7 @@ def _prepare(job: SequenceJob) -> None:
             raise OSError(f"{job.frames.file.parent}: the disk has not kept what was written")
     if job.pairs.is_there():
         return
-    stored = StoredFrames.open(job.frames.file.parent, table, options.image_size)
+    stored = StoredFrames(job.frames.file.parent, table, options.image_size)
     with torch.inference_mode():
         pairs = choose_pairs(stored, job.name, job.role, options)
         grid = options.correction_grid

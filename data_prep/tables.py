@@ -15,7 +15,8 @@ import pyarrow.parquet as pq
 from data_prep.filter import Verdict
 from data_prep.sequence_job import PrepContext, SequenceJob, reference_frames
 from data_prep.split import Split
-from extrap_train.data.prepared import FORMAT, TABLES, table_digest
+from extrap_train.data.frame_files import table_digest
+from extrap_train.data.prepared import FORMAT, TABLES
 from extrap_train.data.sequences import FrameSequence
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import atomic_file, write_atomic

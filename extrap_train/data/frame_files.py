@@ -1,12 +1,13 @@
 """The folder of one prepared sequence: what is in it, and how it gets there whole or not at all."""
 
+import hashlib
 import json
 import math
 import re
 import zlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from hashlib import sha256
+from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +15,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
 from jaxtyping import Float, Float16, Shaped, UInt8
-from pydantic import TypeAdapter, ValidationError
 from torch import Tensor
 
 from extrap_train.data.frame_codec import decode_depth, decode_image, encode_depth, encode_image
 from extrap_train.data.paths import file_stamp
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import atomic_folder, save_array
+from extrap_train.store.records import read_record
 from extrap_train.views import Camera, View
 
 FLOWS = "flows.npy"
@@ -29,7 +30,7 @@ FRAMES, CAMERAS = "frames.npy", "frames.parquet"
 """A sequence's encoded frames (`frame_codec`), one after the other, and their table."""
 REMEDY = "run data_prep again, which makes what is damaged once more"
 _PARTS = ("image", "depth")
-_KEY, _SIZES, _DIGEST = b"key", b"sizes", b"sha256"
+_SEAL = ".seal"
 _SAFE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}")
 
 
@@ -46,14 +47,15 @@ class SequenceFrames:
     the square, and training reads none."""
 
 
-class FrameArchive:
-    """The frames of one sequence on disk, each decoded when it is asked for.
+class StoredFrames:
+    """The frames of one prepared sequence on disk, each decoded when it is asked for.
 
-    InputError where the file is not as long as the table says, or a frame is not what was written.
+    From their folder and their table of cameras; they have `side` × `side` pixels. InputError where
+    the file is not as long as the table says, or a frame is not what was written.
     """
 
     def __init__(self, folder: Path, table: pa.Table, side: int) -> None:
-        self._file, self._side = folder / FRAMES, side
+        self._file, self._table, self._side = folder / FRAMES, table, side
         sizes = np.stack([table[f"{part}_bytes"].to_numpy() for part in _PARTS], 1)
         self._ends = sizes.astype(np.int64).cumsum().reshape(sizes.shape)
         self._starts = self._ends - sizes
@@ -62,6 +64,23 @@ class FrameArchive:
         if self._content.dtype != np.uint8 or self._content.shape != (int(sizes.sum()),):
             raise damaged_error(folder, f"{FRAMES} is not as long as it was")
 
+    @cached_property
+    def camera(self) -> Camera:
+        """All cameras."""
+        world_to_cam = matrices_of(self._table, "world_to_cam", (4, 4))
+        intrinsics = matrices_of(self._table, "intrinsics", (3, 3))
+        return Camera(world_to_cam, intrinsics, self._side, self._side)
+
+    @property
+    def depth_share(self) -> Float[np.ndarray, " n"]:
+        """Of each frame's pixels, how many have a depth."""
+        return self._table["depth_share"].to_numpy()
+
+    @property
+    def depth_scale(self) -> float:
+        """The sequence's unit of depth in scene units."""
+        return float(self._table["depth_scale"][0].as_py())
+
     def image(self, index: int) -> UInt8[Tensor, "3 h w"]:
         """The photograph's bytes of colour."""
         return torch.from_numpy(self._decoded(index, 0, decode_image))
@@ -69,6 +88,12 @@ class FrameArchive:
     def depth(self, index: int) -> Float16[Tensor, "h w"]:
         """The depth map in the sequence's unit; 0 is unknown."""
         return torch.from_numpy(self._decoded(index, 1, decode_depth))
+
+    def view(self, index: int) -> View:
+        """A frame with its depth in scene units; 0 is unknown."""
+        image = self.image(index).float().div_(255)
+        depth = self.depth(index).float().mul_(self.depth_scale)
+        return View(image, self.camera[index], depth)
 
     def _decoded(
         self, index: int, part: int, decode: Callable[[np.ndarray, int], np.ndarray]
@@ -83,36 +108,6 @@ class FrameArchive:
                 f"{self._file} is damaged ({_PARTS[part]} of frame {index}: {error}); delete its "
                 "folder and run data_prep again"
             ) from None
-
-
-@dataclass(frozen=True)
-class StoredFrames:
-    """A prepared sequence's frames on disk, read one at a time."""
-
-    archive: FrameArchive
-    camera: Camera
-    depth_share: Float[np.ndarray, " n"]
-    """Of each frame's pixels, how many have a depth."""
-    depth_scale: float
-
-    @classmethod
-    def open(cls, folder: Path, table: pa.Table, side: int) -> "StoredFrames":
-        """From the folder's table of cameras; frames have `side` × `side` pixels."""
-        camera = Camera(
-            matrices_of(table, "world_to_cam", (4, 4)),
-            matrices_of(table, "intrinsics", (3, 3)),
-            side,
-            side,
-        )
-        scale = float(table["depth_scale"][0].as_py())
-        archive = FrameArchive(folder, table, side)
-        return cls(archive, camera, table["depth_share"].to_numpy(), scale)
-
-    def view(self, index: int) -> View:
-        """A frame with its depth in scene units; 0 is unknown."""
-        image = self.archive.image(index).float().div_(255)
-        depth = self.archive.depth(index).float().mul_(self.depth_scale)
-        return View(image, self.camera[index], depth)
 
 
 def damaged_error(place: Path, what: str) -> InputError:
@@ -178,11 +173,21 @@ def write_frames(place: "SealedTable", frames: SequenceFrames) -> None:
 
 
 @dataclass(frozen=True)
-class SealedTable:
-    """A table that seals the arrays beside it, in a folder that is there whole or not at all.
+class _Seal:
+    """What the files of a folder must be, as JSON beside its table."""
 
-    It holds `key`, what it was made from, how long each file must be, and its own digest: what the
-    disk has made of them is compared with that, not with itself.
+    key: str
+    table: str
+    """`table_digest` of it."""
+    sizes: dict[str, int]
+    """In bytes, of the arrays beside it."""
+
+
+@dataclass(frozen=True)
+class SealedTable:
+    """A table and the arrays beside it, in a folder that is there whole or not at all.
+
+    `key` says what they were made from.
     """
 
     file: Path
@@ -196,39 +201,34 @@ class SealedTable:
     def read(self) -> pa.Table | None:
         """The table, if `is_there`."""
         try:
-            table = pq.read_table(self.file)
-            seal = table.schema.metadata or {}
-            sizes = TypeAdapter(dict[str, int]).validate_json(seal.get(_SIZES, b""), strict=True)
-            is_sound = seal.get(_DIGEST) == _digest(table)
-        except (OSError, pa.ArrowException, ValidationError, UnicodeDecodeError):
+            seal = read_record(self.file.with_suffix(_SEAL), _Seal, REMEDY)
+        except InputError:
             return None
-        stamps = [(file_stamp(self.file.with_name(name)), size) for name, size in sizes.items()]
+        stamps = [
+            (file_stamp(self.file.with_name(name)), size) for name, size in seal.sizes.items()
+        ]
         is_whole = all(stamp is not None and stamp[0] == size for stamp, size in stamps)
-        return table if is_sound and is_whole and seal.get(_KEY) == self.key.encode() else None
+        if not is_whole or seal.key != self.key or table_digest(self.file) != seal.table:
+            return None
+        return pq.read_table(self.file)
 
     def write(self, table: pa.Table, arrays: Mapping[str, Shaped[np.ndarray, "..."]]) -> None:
         """Write the arrays by their files' names, and the table; what is there whole stays."""
         with atomic_folder(self.file.parent, lambda _: self.is_there()) as made:
             sizes = {name: save_array(made / name, arrays[name]) for name in sorted(arrays)}
-            seal = {_KEY: self.key.encode(), _SIZES: json.dumps(sizes).encode()}
-            seal[_DIGEST] = _digest(_as_read(table))
-            pq.write_table(table.replace_schema_metadata(seal), made / self.file.name)
+            file = made / self.file.name
+            pq.write_table(table.replace_schema_metadata(None), file)
+            seal = _Seal(self.key, table_digest(file), sizes)
+            file.with_suffix(_SEAL).write_text(json.dumps(asdict(seal)))
 
 
-def _as_read(table: pa.Table) -> pa.Table:
-    """The table with the types that it has once it was read from a file."""
-    sink = pa.BufferOutputStream()
-    pq.write_table(table, sink)
-    return pq.read_table(pa.BufferReader(sink.getvalue()))
-
-
-def _digest(table: pa.Table) -> bytes:
-    """SHA-256 of the names, types and values of a table's columns."""
-    sink = pa.BufferOutputStream()
-    plain = table.replace_schema_metadata(None).combine_chunks()
-    with pa.ipc.new_stream(sink, plain.schema) as stream:
-        stream.write_table(plain)
-    return sha256(sink.getvalue()).hexdigest().encode()
+def table_digest(file: Path) -> str:
+    """SHA-256 of a table's file; empty if it cannot be read."""
+    try:
+        with file.open("rb") as content:
+            return hashlib.file_digest(content, "sha256").hexdigest()
+    except OSError:
+        return ""
 
 
 def _camera_table(frames: SequenceFrames, depth_scale: float) -> pa.Table:
@@ -259,4 +259,5 @@ def _safe(part: str) -> str:
     if _SAFE_NAME.fullmatch(part):
         return part
     slug = re.sub(r"[^A-Za-z0-9_-]+", "_", part)[:40]
-    return f"{slug or 'unnamed'}-{sha256(part.encode(errors='surrogatepass')).hexdigest()[:12]}"
+    digest = hashlib.sha256(part.encode(errors="surrogatepass")).hexdigest()
+    return f"{slug or 'unnamed'}-{digest[:12]}"

@@ -13,7 +13,6 @@
 Frames and pairs lie in folders that other preparations may share; the manifest says which.
 """
 
-import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import lru_cache
@@ -31,12 +30,13 @@ from torch import Tensor
 from extrap_train.data.frame_files import (
     FLOWS,
     REMEDY,
-    FrameArchive,
+    StoredFrames,
     damaged_error,
     frames_folder,
     map_array,
     matrices_of,
     pairs_folder,
+    table_digest,
 )
 from extrap_train.errors import InputError
 from extrap_train.store.records import read_record
@@ -144,7 +144,7 @@ class PreparedData:
             self._read_flow_numbers
         )
         self._flows: Callable[[str], np.ndarray] = lru_cache(_OPEN_SEQUENCES)(self._open_flows)
-        self._archive: Callable[[str], FrameArchive] = lru_cache(_OPEN_SEQUENCES)(
+        self._archive: Callable[[str], StoredFrames] = lru_cache(_OPEN_SEQUENCES)(
             self._open_archive
         )
 
@@ -240,12 +240,12 @@ class PreparedData:
             raise damaged_error(folder, f"flows are {flows.shape}")
         return flows
 
-    def _open_archive(self, sequence: str) -> FrameArchive:
+    def _open_archive(self, sequence: str) -> StoredFrames:
         is_lone = self.roles[sequence] == "train and test"
         folder = frames_folder(self._frames_root, sequence, is_lone)
         rows = self._rows[sequence]
         table = self._frames.slice(rows.start, rows.stop - rows.start)
-        return FrameArchive(folder, table, self.image_size)
+        return StoredFrames(folder, table, self.image_size)
 
     def __reduce__(self) -> tuple[Callable[[Path], "PreparedData"], tuple[Path]]:
         """In another process the folder is opened anew: a pickled memory map would be a copy."""
@@ -262,15 +262,6 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     if manifest.format != FORMAT or type(size) is not int:
         raise damaged_error(folder, f"{file} is no manifest of format {FORMAT}")
     return asdict(manifest)
-
-
-def table_digest(file: Path) -> str:
-    """SHA-256 of a table's file; empty if it cannot be read."""
-    try:
-        with file.open("rb") as content:
-            return hashlib.file_digest(content, "sha256").hexdigest()
-    except OSError:
-        return ""
 
 
 def _read_table(folder: Path, name: str, manifest: dict[str, Any]) -> pa.Table:

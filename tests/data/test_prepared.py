@@ -102,7 +102,7 @@ def test_depth_survives_in_any_unit(exponent: float, seed: int, tmp_path_factory
     write_frames(place, frames)
     table = place.read()
     assert table is not None
-    stored = StoredFrames.open(target, table, 4)
+    stored = StoredFrames(target, table, 4)
     for index, depth in enumerate(depths):
         np.testing.assert_allclose(stored.view(index).depth, depth, rtol=2**-11)
     assert SealedTable(place.file, "another key").read() is None

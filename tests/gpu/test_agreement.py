@@ -78,15 +78,14 @@ def test_batches_on_their_way(gpu: torch.device, tmp_path: Path) -> None:
     write_frames(place, SequenceFrames(tuple("abcd"), camera, images, depths, images[..., 0]))
     table = place.read()
     assert table is not None
-    stored = StoredFrames.open(place.file.parent, table, SIZE)
+    stored = StoredFrames(place.file.parent, table, SIZE)
     views = [stored.view(i) for i in range(4)]
-    archive = stored.archive
     packed = Example(
-        archive.image(0),
+        stored.image(0),
         camera[0],
-        torch.stack([archive.image(i) for i in (1, 2, 3)]),
+        torch.stack([stored.image(i) for i in (1, 2, 3)]),
         camera[1:],
-        torch.stack([archive.depth(i) for i in (1, 2, 3)]),
+        torch.stack([stored.depth(i) for i in (1, 2, 3)]),
         depth_unit=stored.depth_scale,
     )
     references = torch.stack([view.image for view in views[1:]])
