@@ -31,7 +31,7 @@ from extrap_train.config import (
     resolve_paths,
 )
 from extrap_train.data.co3d import read_category, require_category
-from extrap_train.data.co3d.set_lists import read_sequence_split
+from extrap_train.data.co3d.annotations import read_sequence_split
 from extrap_train.data.prepared import PreparedData
 from extrap_train.data.sequences import FrameSequence
 from extrap_train.jobs import Launcher
@@ -150,8 +150,8 @@ def _sequences(
     sequences = read_category(root, category)
     if data.set_list is None:
         return sequences, data.test_sequences
-    split = read_sequence_split(root, category, data.set_list)
-    return [s for s in sequences if s.name in split.train | split.test], set(split.test)
+    train, test = read_sequence_split(root, category, data.set_list)
+    return [s for s in sequences if s.name in train | test], set(test)
 
 
 def _source(data: DataConfig) -> dict[str, Any]:

@@ -1,11 +1,13 @@
 """The reader against real photographs: features lie on the epipolar lines of its cameras."""
 
 import numpy as np
+import pytest
 import torch
 from two_views import epipolar_distances
 
 from extrap_train.data.co3d import read_category, read_sequence
-from extrap_train.data.co3d.set_lists import read_set_list
+from extrap_train.data.co3d.annotations import read_sequence_split
+from extrap_train.errors import InputError
 
 
 def test_apple_features_lie_on_their_epipolar_lines(shared):
@@ -31,6 +33,6 @@ def test_hydrant_masks_are_read(shared):
     assert ((centre / size - 0.5).abs() < 0.25).all()
 
 
-def test_set_list_names_every_apple_frame(shared):
-    subsets = read_set_list(shared / "data" / "co3d", "apple", "manyview_dev_0")
-    assert len(subsets["train"]) == 20
+def test_a_many_view_list_holds_no_sequence_out(shared):
+    with pytest.raises(InputError, match="manyview_dev_0"):
+        read_sequence_split(shared / "data" / "co3d", "apple", "manyview_dev_0")

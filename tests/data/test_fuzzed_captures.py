@@ -21,7 +21,7 @@ from posed_folders import write_transforms
 from test_colmap_model import Entry, write_binary, write_text
 
 from extrap_train.data.co3d import read_category
-from extrap_train.data.co3d.set_lists import read_sequence_split
+from extrap_train.data.co3d.annotations import read_sequence_split
 from extrap_train.data.scene_spec import open_scene
 from extrap_train.data.transforms_json import read_cameras
 from extrap_train.errors import InputError

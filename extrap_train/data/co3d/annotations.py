@@ -1,4 +1,4 @@
-"""CO3D's annotation entries (v1 and v2) as typed records, their JSON checked."""
+"""CO3D's annotations (v1 and v2) as typed records, and its set lists, their JSON checked."""
 
 import logging
 import math
@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from extrap_train.data.depth_files import DepthFile
 from extrap_train.data.image_files import MAX_PIXELS
-from extrap_train.data.json_files import read_json_list
+from extrap_train.data.json_files import read_json, read_json_list, require_dict
 from extrap_train.data.paths import check_relative
 from extrap_train.errors import InputError
 from extrap_train.geometry.pytorch3d import NDC_FORMATS
@@ -84,6 +84,42 @@ def read_sequence_annotations(file: Path) -> dict[str, SequenceAnnotation]:
     if bad:
         log.warning("%d sequences have no description, the first: %s", len(bad), bad[0])
     return found
+
+
+def read_sequence_split(
+    root: Path, category: str, name: str
+) -> tuple[frozenset[str], frozenset[str]]:
+    """The sequences that a set list, e.g. `fewview_dev`, has for training, and those for testing.
+
+    Raises InputError where it holds no sequence out: the many-view lists of the second release
+    divide the frames of one.
+    """
+    file = root / category / "set_lists" / f"set_lists_{check_relative(name, root)}.json"
+    if not file.is_file():
+        known = sorted(f.stem.removeprefix("set_lists_") for f in file.parent.glob("set_lists_*"))
+        raise InputError(f"{file}: no such set list; known: {', '.join(known) or 'none'}")
+    content = require_dict(read_json(file), "an object with a list per subset", file)
+    try:
+        train, test = (
+            frozenset(str(sequence) for sequence, _number, _path in content.get(subset, ()))
+            for subset in ("train", "test")
+        )
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"{file}: entries must be [sequence, frame number, path] ({error}); check the file"
+        ) from None
+    advice = (
+        "give data.set_list one that divides sequences, as fewview_dev, or leave it out: then "
+        "data.test_sequences of them are held out, or frames of a lone one"
+    )
+    if shared := sorted(train & test):
+        raise InputError(
+            f"{file}: divides the frames of a sequence ({shared[0]}), not the sequences; {advice}"
+        )
+    if not train or not test:
+        missing = "test" if train else "train"
+        raise InputError(f"{file}: its list {missing!r} is empty; {advice}")
+    return train, test
 
 
 def _parse_entries(file: Path, parse: Callable[[Any, Path], T]) -> Iterator[T | BadEntry]:
