@@ -23,6 +23,7 @@ from extrap_train.config import (
     resolve_paths,
 )
 from extrap_train.data.prepared import PreparedData
+from extrap_train.diffusion.hub import is_repository, weights_folder
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import partial_path, write_atomic
 from extrap_train.store.digests import folder_digest, weights_digest
@@ -41,6 +42,7 @@ from extrap_train.store.records import read_record, read_yaml
 _NOT_PART_OF_THE_RUN = (
     "output",
     "run",
+    "repo",
     "resume",
     "threads",
     "logger",
@@ -194,7 +196,9 @@ def run_manifest(config: TrainConfig, prepared: list[PreparedData]) -> Manifest:
     """What the run follows from: its options, the prepared data, and the weights it starts from."""
     inputs, split = trained_on(config, prepared)
     start = config.model.start
-    if start is not None and start not in packaged_names() and Path(start).exists():
+    if start is not None and is_repository(start):
+        inputs["model.start"] = weights_digest(weights_folder(start, "model.start"))
+    elif start is not None and start not in packaged_names() and Path(start).exists():
         inputs["model.start"] = weights_digest(Path(start))
     return Manifest.of(run_identity(config), inputs, split)
 

@@ -28,9 +28,10 @@ from extrap_train.config import (
 )
 from extrap_train.config.options import option, unset
 from extrap_train.diffusion.generator import DiffusionGenerator
+from extrap_train.diffusion.hub import is_repository, weights_folder
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.model_files import load_model
-from extrap_train.diffusion.packaged import packaged_name, packaged_weights
+from extrap_train.diffusion.packaged import packaged_name
 from extrap_train.errors import InputError
 from extrap_train.store.digests import files_below
 
@@ -49,8 +50,8 @@ class Diffusion:
     )
     weights: str | None = option(
         None,
-        "model folder or packaged model, where `{category}` stands for the capture's; null: "
-        "FAMILY-{category} for ours, FAMILY for the category-agnostic others",
+        "model folder, packaged model or repository, where `{category}` stands for the capture's; "
+        "null: FAMILY-{category} for ours, FAMILY for the category-agnostic others",
     )
     references: int | None = option(
         None, "most inputs that a target is warped from; null: the model's number", low=1
@@ -135,8 +136,10 @@ class Diffusion:
         if self.weights is not None and name not in packaged_names() and Path(name).is_dir():
             return Path(name)
         try:
-            return packaged_weights(name)
-        except InputError:
+            return weights_folder(name, "weights")
+        except InputError as error:
+            if is_repository(name):
+                raise Unavailable(str(error)) from None
             raise Unavailable(
                 f"no weights: {name} is neither a model folder nor in the package; train them with "
                 f"`{self._recipe(category)}` and give the run's model/ folder as "

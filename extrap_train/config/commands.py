@@ -151,6 +151,7 @@ TASKS = {
     "complete": "complete a scene all around: point cloud, views, Gaussians, turntable",
     "depth": "train the network that gives the views of task=complete their depth",
     "pack": "write a trained model as a packaged one",
+    "push": "upload a trained model to the Hugging Face hub (repo=org/name)",
     "scene": "adapt a model to one scene (LoRA)",
     "validate": "measure a trained model on held-out sequences",
     "view": "make one view of a scene (pose=) or a walk around it (orbit=)",
@@ -181,6 +182,7 @@ class TrainConfig(SceneOptions):
         None,
         "name of the run's folder; null: made from the options, so that the same command resumes",
     )
+    repo: str | None = option(None, "repository of the hub that task=push uploads to, as org/name")
     resume: bool = option(True, "continue or reuse what is there; false replaces it")
     output: str = option("outputs", "folder of all results")
     threads: int | None = option(None, "CPU threads; null: every core", low=1)

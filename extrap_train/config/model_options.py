@@ -179,8 +179,8 @@ class ModelConfig:
     weight_decay: float = option(0.01, "weight decay of AdamW", low=0, high=1)
     start: str | None = option(
         None,
-        "weights that training starts from: a model folder, a published checkpoint, or `base`, "
-        "the packaged model; null: random",
+        "weights that training starts from: a model folder, a published checkpoint, a repository "
+        "of the Hugging Face hub, or `base`, the packaged model; null: random",
     )
 
     @property

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from extrap_train.config import MODEL_CONFIG, ModelConfig, dotted, packaged_names, validate_model
 from extrap_train.diffusion.encoders import PixelPatches
+from extrap_train.diffusion.hub import is_repository, weights_folder
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.packaged import compress, packaged_weights, restore
 from extrap_train.diffusion.published.config_compat import SCHEDULER, require_same_config
@@ -137,16 +138,20 @@ def saved_config(folder: Path) -> ModelConfig:
 def ancestors(start: str | None) -> Iterator[tuple[str, Manifest]]:
     """Each model that the start goes back to with its manifest, as far as they have one.
 
-    Published weights have none; they were trained on other data sets.
+    It lies beside the model's folder, or within that of a repository. Published weights have none;
+    they were trained on other data sets.
     """
     known: set[str] = set()
     while start is not None and start not in known:
         known.add(start)
-        folder = packaged_weights(start) if start in packaged_names() else Path(start)
+        is_named = start in packaged_names() or is_repository(start)
+        folder = weights_folder(start, "model.start") if is_named else Path(start)
         if not is_own(folder):
             return
-        if (folder.resolve().parent / MANIFEST).is_file():
-            yield start, read_manifest(folder.resolve().parent, "restore it from its run")
+        for place in (folder.resolve(), folder.resolve().parent):
+            if (place / MANIFEST).is_file():
+                yield start, read_manifest(place, "restore it from its run")
+                break
         start = saved_config(folder).start
 
 
@@ -257,7 +262,7 @@ def _take_over(
 def initial_model(config: ModelConfig) -> ExtrapolationModel:
     """What training starts with: `config.start`'s weights, or random ones at the small size.
 
-    `config.start` is a folder, a published checkpoint or the name of a packaged model.
+    `config.start` is a folder, a published checkpoint, or a name that `weights_folder` knows.
     """
     if config.start is None:
         if config.vae is not None or config.clip is not None:
@@ -284,6 +289,6 @@ def _filled(
         model = ExtrapolationModel(config)
     given = packaged_weights(weights) if weights in packaged_names() else Path(weights)
     path = given if is_compact(given) else weights_at(given)
-    found = packaged_weights(weights, option) if path is None else path
+    found = weights_folder(weights, option) if path is None else path
     load_weights(model, found, option, to_train=to_train)
     return model

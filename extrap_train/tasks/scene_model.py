@@ -14,14 +14,11 @@ from extrap_train.data.scene_spec import scene_address
 from extrap_train.data.sequences import Frame
 from extrap_train.device import advise_on_sampling_memory, require_accelerator
 from extrap_train.diffusion.generator import DiffusionGenerator, GeneratedViews
+from extrap_train.diffusion.hub import weights_folder
 from extrap_train.diffusion.lora import load_adapter, read_adapter_record
 from extrap_train.diffusion.model import ExtrapolationModel, use_channels_last
 from extrap_train.diffusion.model_files import is_own, load_model, published_model, saved_config
-from extrap_train.diffusion.packaged import (
-    packaged_name,
-    packaged_steps,
-    packaged_weights,
-)
+from extrap_train.diffusion.packaged import packaged_name, packaged_steps
 from extrap_train.errors import InputError
 from extrap_train.runs import Finished, RunFolder, newest_run
 from extrap_train.store.digests import folder_digest, weights_digest
@@ -38,7 +35,7 @@ class UsedWeights:
     """Which weights a result was generated with."""
 
     name: str
-    """A packaged model's, or an absolute path."""
+    """A packaged model's or a repository's, or an absolute path."""
     sha256: str
     is_packaged: bool
     steps: int | None
@@ -129,7 +126,8 @@ def _warn_of_another_scene(config: TrainConfig) -> None:
 
 
 def named_weights(config: TrainConfig) -> str:
-    """What `weights` names, or what takes its place: an absolute path, or a packaged model's name.
+    """What `weights` names, or what takes its place: an absolute path, or the name of a packaged
+    model or a repository.
 
     Raises InputError where nothing does.
     """
@@ -156,8 +154,8 @@ def _packaged(config: TrainConfig) -> str:
 def open_model(
     weights: str, adapter: str | None = None, config: ModelConfig | None = None
 ) -> ExtrapolationModel:
-    """The model of a folder, of the package or of a published checkpoint, with a scene's adapter
-    applied if any.
+    """The model of a folder, the package, a repository or a published checkpoint, with a scene's
+    adapter applied if any.
 
     A published checkpoint does not say what it is: it is read as the model that `config` describes.
     InputError where that is another than the saved one.
@@ -180,10 +178,10 @@ def open_model(
 
 
 def _folder_of(weights: str) -> Path:
-    """What `weights` names: a path, or the folder of a packaged model."""
+    """What `weights` names: a path, or the folder of a packaged model or a repository."""
     path = Path(weights)
     is_path = weights not in packaged_names() and path.exists()
-    return path if is_path else packaged_weights(weights, "weights")
+    return path if is_path else weights_folder(weights, "weights")
 
 
 def device_of(config: TrainConfig) -> torch.device:

@@ -1,0 +1,111 @@
+"""A model's card: what it was made from and how well it does, as its files say."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from huggingface_hub import ModelCard, ModelCardData
+
+from extrap_train.config import packaged_names
+from extrap_train.data.json_files import read_json
+from extrap_train.diffusion.hub import HUB_FAILURES, is_repository
+from extrap_train.diffusion.model_files import is_own, saved_config
+from extrap_train.runs import RunFolder
+from extrap_train.store.manifest import MANIFEST, Manifest, read_manifest
+
+_TAGS = ["extrap-train", "novel-view-synthesis", "diffusion"]
+_OF_DATA = {
+    "synthetic": "captures rendered by extrap-train",
+    "co3d": "captures of CO3D (CC BY-NC 4.0)",
+}
+
+
+def model_card(folder: Path, name: str, steps: int | None) -> str:
+    """The card of a model's folder, to be published as `name`, as Markdown with a YAML head.
+
+    Manifest and metrics are those of its run, where it lies in one. Its licence is only claimed
+    where starting weights and data are this project's own.
+    """
+    model, run = saved_config(folder), RunFolder(folder.resolve().parent)
+    manifest = read_manifest(run.path) if (run.path / MANIFEST).is_file() else None
+    start, licence = _start(model.start)
+    sources = {split.source for split in manifest.split.values()} if manifest else {None}
+    head = ModelCardData(
+        license="apache-2.0" if licence == "Apache-2.0" and sources == {"synthetic"} else "other",
+        library_name="extrap-train",
+        base_model=start if is_repository(start) else None,
+        tags=_TAGS,
+    )
+    rows = {
+        "model": f"`{model.family}`, {model.image_size} x {model.image_size} pixels, from up to "
+        f"{model.num_condition_views} references",
+        "trained on": _data(manifest),
+        "steps": "unknown" if steps is None else f"{steps:,}",
+        "started from": f"{start} ({licence})",
+        "code": f"extrap-train {manifest.code if manifest else ''}".rstrip(),
+    }
+    categories = ", ".join(manifest.split) if manifest else "what it was trained on"
+    return "\n".join(
+        [
+            f"---\n{head.to_yaml()}\n---\n\n# {name}\n",
+            f"A diffusion model that generates views of {categories} from a few posed photos.\n",
+            "```bash",
+            f"python -m extrap_train task=complete category=NAME scene=FOLDER weights={name}",
+            "```\n\n| | |\n|---|---|",
+            *(f"| {key} | {value} |" for key, value in rows.items()),
+            *(_scores(read_json(run.summary)) if run.summary.is_file() else []),
+            "",
+        ]
+    )
+
+
+def _data(manifest: Manifest | None) -> str:
+    if manifest is None or not manifest.split:
+        return "unknown"
+    splits = manifest.split.values()
+    sources = sorted({_OF_DATA.get(split.source, split.source) for split in splits})
+    return (
+        f"{sum(len(split.train) for split in splits)} {' and '.join(sources)}; "
+        f"{sum(len(split.test) for split in splits)} held out ({MANIFEST} lists both)"
+    )
+
+
+def _start(start: str | None) -> tuple[str, str]:
+    """What a chain of starts goes back to, and its licence."""
+    while start is not None and start not in packaged_names() and is_own(Path(start)):
+        start = saved_config(Path(start)).start
+    if start is None:
+        return "random weights", "Apache-2.0"
+    if start in packaged_names():
+        return f"`{start}` of extrap-train", "Apache-2.0"
+    if is_repository(start):
+        return start, _licence_of(start)
+    return f"`{Path(start).name}`", "its authors' licence"
+
+
+def _licence_of(repository: str) -> str:
+    name, _, _ = repository.partition("@")
+    try:
+        said = ModelCard.load(name).data.license
+    except HUB_FAILURES:
+        said = None
+    return {"apache-2.0": "Apache-2.0"}.get(
+        str(said), str(said or "the licence that its page names")
+    )
+
+
+def _scores(summary: Mapping[str, Any]) -> list[str]:
+    """The held-out views' mean scores, as the run's summary has them."""
+    validation = summary.get("validation")
+    if not isinstance(validation, dict) or not validation.get("model"):
+        return []
+    metrics = list(validation["model"])
+    lines = [
+        "\nHeld-out views:\n",
+        f"| | {' | '.join(metrics)} |",
+        "|---" * (len(metrics) + 1) + "|",
+    ]
+    for method, row in validation.items():
+        numbers = ["–" if row.get(m) is None else f"{row[m]:.4g}" for m in metrics]
+        lines.append(f"| {method} | {' | '.join(numbers)} |")
+    return lines

@@ -1,0 +1,88 @@
+"""`task=push`: a trained model on the Hugging Face hub, with a card that says what it is."""
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from huggingface_hub import CommitOperationAdd, HfApi
+
+from extrap_train.config import MODEL_CONFIG, TrainConfig, packaged_names
+from extrap_train.diffusion.hub import (
+    FILES,
+    HUB_FAILURES,
+    first_line,
+    is_repository,
+    weights_folder,
+)
+from extrap_train.diffusion.model_files import is_own, load_model, saved_config
+from extrap_train.errors import InputError
+from extrap_train.runs import RunFolder, existing_run
+from extrap_train.store.manifest import MANIFEST, read_manifest
+from extrap_train.tasks.model_card import model_card
+from extrap_train.tasks.scene_model import UsedWeights
+from extrap_train.terminal import terminal
+
+
+def run(config: TrainConfig) -> None:
+    """Upload the newest (or `weights`) model in one commit; a new repository is private."""
+    if not config.repo:
+        raise InputError("repo is not given: give repo=org/name, which the model is uploaded to")
+    folder = _model_folder(config)
+    steps = UsedWeights.of(replace(config, weights=_name(folder), adapter=None)).steps
+    load_model(folder)  # what cannot be read is not published
+    api, console = HfApi(), terminal()
+    try:
+        card = model_card(folder, config.repo, steps)
+        place = api.create_repo(config.repo, private=True, exist_ok=True)
+        files: dict[str, str | bytes] = {
+            path.relative_to(folder).as_posix(): str(path) for path in _files(folder)
+        }
+        files |= {"README.md": card.encode(), **_records(folder)}
+        added = [CommitOperationAdd(name, content) for name, content in files.items()]
+        commit = api.create_commit(config.repo, added, commit_message="Upload the model")
+    except HUB_FAILURES as error:
+        raise InputError(
+            f"repo={config.repo}: {first_line(error)}; check the name and the network, and log in "
+            "with a token that may write (hf auth login)"
+        ) from None
+    console.print(f"{len(added)} files; a new repository is private until you open it there")
+    console.print(f"use it: weights={config.repo}@{commit.oid}\nresult: {place}")
+
+
+def _files(folder: Path) -> list[Path]:
+    return sorted(path for pattern in FILES for path in folder.rglob(pattern) if path.is_file())
+
+
+def _records(folder: Path) -> dict[str, bytes]:
+    """The model's configuration and its run's manifest, without the places of this machine."""
+    model, beside = saved_config(folder), folder.resolve().parent
+    start = model.start
+    if start not in (None, *packaged_names()) and not is_repository(str(start)):
+        model = replace(model, start=f"local:{Path(str(start)).name}")
+    records: dict[str, Any] = {MODEL_CONFIG: model}
+    if (beside / MANIFEST).is_file():
+        records[MANIFEST] = replace(read_manifest(beside), options={})
+    return {name: json.dumps(asdict(x), indent=1).encode() for name, x in records.items()}
+
+
+def _model_folder(config: TrainConfig) -> Path:
+    """Of the run, model folder or packaged model that `weights` names; by default of the latest
+    run.
+    """
+    if config.weights is None:
+        return existing_run(config).model
+    if config.weights in packaged_names():
+        return weights_folder(config.weights, "weights")
+    given = Path(config.weights)
+    folder = given if is_own(given) else RunFolder(given).model
+    if not is_own(folder):
+        raise InputError(
+            f"weights={given}: is no model of this project; give a run's folder or its model/"
+        )
+    return folder
+
+
+def _name(folder: Path) -> str:
+    """A packaged model's own, whose length of training is known by it."""
+    return folder.name if folder.name in packaged_names() else str(folder)

@@ -1,0 +1,142 @@
+"""Models of the hub: pushed with a card, downloaded once, and found again without a network."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from hub_server import Hub, serve_hub
+from huggingface_hub import ModelCard
+from in_process import refused_command, run_command
+from opened_runs import hydrant_config
+from runs_of_hub import finished_run
+
+from benchmarks.methods.base import Unavailable
+from benchmarks.methods.diffusion import Diffusion
+from extrap_train.__main__ import main
+from extrap_train.config import packaged_names
+from extrap_train.diffusion import hub as hub_module
+from extrap_train.diffusion.hub import is_repository
+from extrap_train.diffusion.model_files import ancestors, load_model
+from extrap_train.errors import InputError
+from extrap_train.runs import run_manifest
+from extrap_train.tasks.scene_model import UsedWeights
+
+_PUSHED = "me/small.hydrants-v1.5"
+_ASK = """
+import sys
+from extrap_train.diffusion.hub import weights_folder
+from extrap_train.errors import InputError
+for name in sys.argv[1:]:
+    try:
+        print(weights_folder(name, "weights"))
+    except InputError as error:
+        print(f"error: {error}")
+"""
+
+
+def _ask(hub: Hub, cache: Path, *names: str) -> list[str]:
+    """The folder of each, or why there is none, in a process that reads its own environment."""
+    environment = os.environ | {"HF_ENDPOINT": hub.address, "HF_HOME": str(cache)}
+    command = [sys.executable, "-c", _ASK, *names]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+def test_a_pushed_model_is_loaded_from_a_clean_cache_and_again_without_the_hub(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, cache = finished_run(tmp_path / "private_place"), tmp_path / "cache"
+    with serve_hub() as hub:
+        words = ["task=push", "category=hydrant", f"weights={run.path}", f"repo={_PUSHED}"]
+        monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", hub.address)
+        said = run_command(main, *words)
+        assert hub.private == {_PUSHED}
+        ((commit, files),) = hub.commits[_PUSHED].items()
+        assert f"weights={_PUSHED}@{commit}" in said
+        later = hub.add(_PUSHED, {"README.md": b"# other words"})
+        hub.add("me/pickles", {"pytorch_model.bin": b"\x80", "config.json": b"{}"})
+        names = [_PUSHED, f"{_PUSHED}@{commit}", "me/pickles", "me/none", f"{_PUSHED}@v9"]
+        newest, pinned, pickles, nobody, unknown = _ask(hub, cache, *names)
+        assert [Path(newest).name, Path(pinned).name] == [later, commit]
+        assert "no model of this project" in pickles
+        assert "no such repository" in nobody
+        assert "no revision v9" in unknown
+        assert not any(name.endswith(".bin") for name in hub.downloads)
+    again, missing = _ask(hub, cache, f"{_PUSHED}@{commit}", "me/none")
+    assert again == pinned
+    assert "cannot be reached" in missing
+
+    wanted, found = load_model(run.model), load_model(Path(pinned))
+    assert torch.equal(found.unet.conv_in.weight, wanted.unet.conv_in.weight)
+    assert not any(path.suffix == ".md" for path in Path(pinned).rglob("*"))
+    _check_card(files["README.md"].decode())
+    assert not any(b"private_place" in content for content in files.values())
+    assert "model/pickle.bin" not in files
+    assert json.loads(files["manifest.json"])["split"]["hydrant"]["train"] == ["0001"]
+
+
+def _check_card(text: str) -> None:
+    card = ModelCard(text)
+    assert card.data.license == "other"  # it started from weights of others
+    for said in ("zeronvs.ckpt", "its authors", "| steps | 7 |", "1 captures", "| model | 24 |"):
+        assert said in card.text
+
+
+@pytest.fixture
+def downloaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder that `me/downloaded` is cached in, with its run's manifest within."""
+    run = finished_run(tmp_path)
+    (run.path / "manifest.json").rename(run.model / "manifest.json")
+    known = {"me/downloaded": run.model}
+
+    def download(name: str, option: str) -> Path:
+        if name not in known:
+            raise InputError(f"{option}={name}: cannot be reached")
+        return known[name]
+
+    monkeypatch.setattr(hub_module, "_download", download)
+    return run.model
+
+
+def test_results_and_trainings_follow_from_the_content_of_a_repository(
+    downloaded: Path, tmp_path: Path
+) -> None:
+    config = hydrant_config(tmp_path)
+    used = UsedWeights.of(replace(config, weights="me/downloaded"))
+    assert (used.name, used.is_packaged, used.steps) == ("me/downloaded", False, None)
+    started = replace(config, model=replace(config.model, start="me/downloaded"))
+    started.category.members = []
+    assert run_manifest(started, []).inputs == {"model.start": used.sha256}
+    ((name, manifest),) = ancestors("me/downloaded")
+    assert (name, manifest.split["hydrant"].train) == ("me/downloaded", ("0001",))
+
+
+def test_a_table_compares_a_repository(downloaded: Path) -> None:
+    assert downloaded / "extrapolation_model.json" in Diffusion(
+        weights="me/downloaded"
+    ).weight_files("cup")
+    with pytest.raises(Unavailable, match="cannot be reached"):
+        Diffusion(weights="me/{category}s").weight_files("cup")
+
+
+def test_paths_and_files_are_no_repositories(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs" / "mine").mkdir(parents=True)
+    assert all(map(is_repository, ["a/b", "a/b@main", "org-1/v1.5@refs/pr/1"]))
+    others = ["runs/mine", "./b", "../b", "/a/b", "a/b/c", "runs/b.ckpt", "a/b@", *packaged_names()]
+    assert not any(map(is_repository, others))
+
+
+def test_a_push_without_a_place_or_of_no_model_is_one_line(tmp_path: Path) -> None:
+    said = refused_command(["task=push", "category=hydrant", "weights=base"], tmp_path)
+    assert "repo=org/name" in said
+    words = ["task=push", "category=hydrant", f"weights={tmp_path}", "repo=me/x"]
+    assert "no model of this project" in refused_command(words, tmp_path)
