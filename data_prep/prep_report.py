@@ -17,9 +17,9 @@ from data_prep.drop_summary import group_reasons
 from extrap_train.data.examples import linspace_indices, pack, read_example
 from extrap_train.data.prepared import UNTOUCHED, Pairs, PreparedData
 from extrap_train.data.square_frames import held_out_mask
+from extrap_train.figures import colour_depth, contact_sheet, error_map, mark_holes
 from extrap_train.geometry.viewpoints import fit_orbit
 from extrap_train.geometry.warp import warp_references
-from extrap_train.pictures import colour_depth, contact_sheet, error_map, mark_holes
 from extrap_train.store.atomic import write_atomic
 
 WORST = 20

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from extrap_train.config import StereoConfig
     from extrap_train.data.scene_spec import open_scene
     from extrap_train.errors import InputError
+    from extrap_train.figures import save_picture
     from extrap_train.gaussians.ply import write_splats
-    from extrap_train.pictures import save_picture
     from extrap_train.tasks.view import walk_around
     from extrap_train.views import Camera, View, Warp, stack_cameras
 
@@ -35,7 +35,7 @@ _MODULES = {
     "extrap_train.config": ("StereoConfig",),
     "extrap_train.errors": ("InputError",),
     "extrap_train.gaussians.ply": ("write_splats",),
-    "extrap_train.pictures": ("save_picture",),
+    "extrap_train.figures": ("save_picture",),
     "benchmarks.methods.base": ("Stopwatch", "Synthesis"),
 }  # fmt: skip
 _HOMES = {name: module for module, names in _MODULES.items() for name in names}

@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from extrap_train.pictures import contact_sheet
+from extrap_train.figures import contact_sheet
 
 GREY = torch.tensor([0.2, 0.6])[:, None, None, None].expand(2, 3, 64, 64)
 """Two rows: 51 and 153 of 255."""

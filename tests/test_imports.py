@@ -26,7 +26,7 @@ _ORDER = (
     "extrap_train.matching",
     "extrap_train.depth",
     "extrap_train.data",
-    "extrap_train.pictures",
+    "extrap_train.figures",
     "extrap_train.diffusion",
     "extrap_train.reconstruction",
     "extrap_train.gaussians",

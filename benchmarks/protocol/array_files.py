@@ -63,13 +63,6 @@ def _is_usual(file: Path) -> bool:
     return file.is_file() and file.stat().st_size <= _MAX_BYTES
 
 
-def png_bytes(pixels: UInt8[np.ndarray, "h w 3"]) -> bytes:
-    """A picture as a PNG."""
-    content = io.BytesIO()
-    Image.fromarray(pixels).save(content, "png")
-    return content.getvalue()
-
-
 def pictures_of(pictures: Mapping[Path, bytes], side: int) -> Float[Tensor, "n 3 side side"]:
     """The pictures in files of `png_bytes`, colours in [0, 1]; InputError for any others."""
     pixels = [_decoded(content, side, file) for file, content in pictures.items()]

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.methods.base import Stopwatch
-from benchmarks.protocol.array_files import npy_bytes, png_bytes
+from benchmarks.protocol.array_files import npy_bytes
 from benchmarks.protocol.captures import Capture
 from benchmarks.protocol.draws import Draw
 from benchmarks.protocol.prepared_scene import (
@@ -21,7 +21,7 @@ from benchmarks.protocol.prepared_scene import (
 )
 from extrap_train.config import DatasetDepthConfig, DepthConfig, RulesConfig
 from extrap_train.data.examples import query_batch
-from extrap_train.data.image_files import to_eight_bits
+from extrap_train.data.image_files import png_bytes, to_eight_bits
 from extrap_train.depth import NoDepthError
 from extrap_train.depth.sources import depth_source
 from extrap_train.errors import InputError

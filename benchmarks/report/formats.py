@@ -23,7 +23,7 @@ from benchmarks.report.table_layout import Entry, Layout, name_of
 from benchmarks.run.cells import OK, Cell, one_line
 from extrap_train.data.image_files import to_eight_bits
 from extrap_train.errors import InputError
-from extrap_train.pictures import error_map
+from extrap_train.figures import error_map
 
 _MARKDOWN_SPECIAL = {"<": "&lt;", ">": "&gt;"} | {letter: f"\\{letter}" for letter in "\\`*|[]"}
 _LATEX_SPECIAL = {

@@ -24,7 +24,6 @@ from benchmarks.protocol.array_files import (
     Number,
     Positive,
     npy_bytes,
-    png_bytes,
     read_limited,
     sha256_of,
 )
@@ -33,6 +32,7 @@ from benchmarks.protocol.prepared_scene import Scene
 from benchmarks.score import Score
 from extrap_train.config import MethodConfig, ScoringConfig, TableConfig
 from extrap_train.config.options import MISSING
+from extrap_train.data.image_files import png_bytes
 from extrap_train.data.json_files import read_json
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import atomic_folder

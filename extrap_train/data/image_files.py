@@ -5,6 +5,7 @@ way its camera holds it.
 """
 
 import functools
+import io
 import logging
 import math
 import operator
@@ -168,6 +169,13 @@ def nearest_pixels(
 def to_eight_bits(values: Float[Tensor, "..."]) -> UInt8[np.ndarray, "..."]:
     """Values in [0, 1], those beyond clipped, as bytes."""
     return values.detach().cpu().clamp(0, 1).mul(255).round().to(torch.uint8).numpy()
+
+
+def png_bytes(pixels: Shaped[np.ndarray, "h w *c"]) -> bytes:
+    """Grey values or colours as the content of a PNG."""
+    content = io.BytesIO()
+    Image.fromarray(pixels).save(content, "png")
+    return content.getvalue()
 
 
 def image_size(path: Path, annotated: tuple[int, int] | None = None) -> tuple[int, int]:

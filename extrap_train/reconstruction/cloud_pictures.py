@@ -11,10 +11,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from extrap_train.figures import contact_sheet, film
 from extrap_train.geometry.orbits import fit_circle
 from extrap_train.geometry.viewpoints import camera_centers, scene_center
 from extrap_train.geometry.warp import splat_points
-from extrap_train.pictures import contact_sheet, film
 from extrap_train.reconstruction.cloud import PointCloud
 from extrap_train.reconstruction.global_map import GIVEN, GlobalMap
 from extrap_train.reconstruction.planner import Query, circle_cameras

@@ -14,7 +14,7 @@ from extrap_train.data.prepared import PreparedData
 from extrap_train.diffusion.evaluation import Prediction, summarise
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.errors import InputError
-from extrap_train.pictures import contact_sheet, curve, error_map, mark_holes
+from extrap_train.figures import contact_sheet, curve, error_map, mark_holes
 from extrap_train.runs import RunFolder, provenance
 from extrap_train.store.atomic import write_atomic
 from extrap_train.store.digests import folder_digest

@@ -28,8 +28,8 @@ from extrap_train.diffusion.lora import (
 )
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError
+from extrap_train.figures import contact_sheet, curve, error_map, mark_holes
 from extrap_train.metrics import Distance, lpips_or_reason
-from extrap_train.pictures import contact_sheet, curve, error_map, mark_holes
 from extrap_train.store import Outcome
 from extrap_train.store.atomic import write_atomic
 from extrap_train.store.digests import file_digest

@@ -13,6 +13,7 @@ from torch import Tensor
 from extrap_train.config import SplatsConfig
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError
+from extrap_train.figures import contact_sheet, error_map
 from extrap_train.gaussians.fit import fit_views
 from extrap_train.gaussians.gaussian_model import Gaussians
 from extrap_train.gaussians.gaussian_options import BACKGROUNDS, GaussianOptions
@@ -20,7 +21,6 @@ from extrap_train.gaussians.ply import read_comments, read_splats, write_splats
 from extrap_train.gaussians.rasterize import draw, rasterizer
 from extrap_train.geometry.world_frame import WorldFrame
 from extrap_train.metrics import psnr, quantised
-from extrap_train.pictures import contact_sheet, error_map
 from extrap_train.reconstruction.global_map import GlobalMap
 from extrap_train.views import View
 

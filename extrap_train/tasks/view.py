@@ -19,9 +19,9 @@ from extrap_train.data.square_frames import object_square
 from extrap_train.data.transforms_json import read_cameras
 from extrap_train.diffusion.generator import GeneratedViews
 from extrap_train.errors import InputError, did_you_mean
+from extrap_train.figures import contact_sheet, film, mark_holes, picture_names, save_picture
 from extrap_train.geometry.orbits import LEAST_VIEWS, orbit_cameras
 from extrap_train.metrics import psnr, quantised
-from extrap_train.pictures import contact_sheet, film, mark_holes, picture_names, save_picture
 from extrap_train.store.manifest import claim
 from extrap_train.store.records import write_record
 from extrap_train.tasks.scene_inputs import (

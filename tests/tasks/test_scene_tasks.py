@@ -19,7 +19,7 @@ from extrap_train.data.scene_spec import open_scene
 from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.diffusion.lora import AdapterOrigin, add_adapter, save_adapter
 from extrap_train.diffusion.model_files import load_model, save_model
-from extrap_train.pictures import picture_names
+from extrap_train.figures import picture_names
 from extrap_train.tasks.scene_inputs import frame_digest
 
 

@@ -18,7 +18,7 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from extrap_train.data.co3d import FRAME_ANNOTATIONS, SEQUENCE_ANNOTATIONS
-from extrap_train.data.image_files import to_eight_bits
+from extrap_train.data.image_files import png_bytes, to_eight_bits
 from extrap_train.geometry.pytorch3d import viewpoint_from_camera
 from extrap_train.store.atomic import write_atomic
 from extrap_train.views import Camera, View
@@ -105,14 +105,14 @@ def _write_depth(root: Path, folder: str, stem: str, depth: Float[Tensor, "h w"]
         raise ValueError("depth must be finite, not negative and within the range of float16")
     path = f"{folder}/depths/{stem}.jpg.geometric.png"
     mask_path = f"{folder}/depth_masks/{stem}.png"
-    write_atomic(root / path, _png(Image.fromarray(half.numpy().view(np.uint16))))
-    write_atomic(root / mask_path, _png(Image.fromarray((half > 0).numpy())))
+    write_atomic(root / path, png_bytes(half.numpy().view(np.uint16)))
+    write_atomic(root / mask_path, png_bytes((half > 0).numpy()))
     return {"path": path, "scale_adjustment": 1.0, "mask_path": mask_path}
 
 
 def _write_mask(root: Path, folder: str, stem: str, mask: Float[Tensor, "h w"]) -> dict[str, Any]:
     path = f"{folder}/masks/{stem}.png"
-    write_atomic(root / path, _png(Image.fromarray(to_eight_bits(mask))))
+    write_atomic(root / path, png_bytes(to_eight_bits(mask)))
     return {"path": path, "mass": float(mask.sum())}
 
 
@@ -143,12 +143,6 @@ def _jpeg(image: Float[Tensor, "3 h w"]) -> bytes:
     return content.getvalue()
 
 
-def _png(picture: Image.Image) -> bytes:
-    content = io.BytesIO()
-    picture.save(content, "PNG")
-    return content.getvalue()
-
-
 def _jgz(content: Any) -> bytes:
     # Without the time of writing, equal content gives equal bytes.
     return gzip.compress(json.dumps(content).encode(), compresslevel=6, mtime=0)
@@ -157,10 +151,9 @@ def _jgz(content: Any) -> bytes:
 def _ply(points: Float[Tensor, "n 3"], colors: Float[Tensor, "n 3"]) -> bytes:
     kinds = [(axis, "<f4") for axis in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
     vertices = np.empty(len(points), dtype=kinds)
-    for index, axis in enumerate("xyz"):
-        vertices[axis] = points[:, index].cpu().numpy()
-    for index, name in enumerate(("red", "green", "blue")):
-        vertices[name] = to_eight_bits(colors[:, index])
+    columns = np.c_[points.cpu().numpy(), to_eight_bits(colors)].T
+    for (name, _), column in zip(kinds, columns, strict=True):
+        vertices[name] = column
     content = io.BytesIO()
     PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(content)
     return content.getvalue()

@@ -1,4 +1,4 @@
-"""Pictures that go with the numbers: contact sheets, curves and films."""
+"""Figures that go with the numbers: contact sheets, curves and films."""
 
 import io
 import itertools
@@ -16,7 +16,7 @@ from matplotlib import font_manager
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from extrap_train.data.image_files import to_eight_bits
+from extrap_train.data.image_files import png_bytes, to_eight_bits
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import partial_path, replace_synced, write_atomic
 
@@ -93,9 +93,7 @@ def _written_on(sheet: np.ndarray, texts: dict[tuple[int, int], str]) -> bytes:
     font = ImageFont.truetype(font_manager.findfont("DejaVu Sans"), _FONT_PIXELS)
     for place, text in texts.items():
         draw.text(place, text, fill=(0, 0, 0), font=font)
-    content = io.BytesIO()
-    picture.save(content, "png")
-    return content.getvalue()
+    return png_bytes(np.asarray(picture))
 
 
 def curve(steps: list[int], series: dict[str, list[float]], label: str, path: Path) -> None:
@@ -114,9 +112,7 @@ def curve(steps: list[int], series: dict[str, list[float]], label: str, path: Pa
 
 def save_picture(image: Float[Tensor, "3 h w"], path: Path) -> None:
     """Write one picture as PNG."""
-    content = io.BytesIO()
-    Image.fromarray(to_eight_bits(image).transpose(1, 2, 0)).save(content, "png")
-    write_atomic(path, content.getvalue())
+    write_atomic(path, png_bytes(to_eight_bits(image).transpose(1, 2, 0)))
 
 
 def picture_names(names: Sequence[str]) -> list[str]:
