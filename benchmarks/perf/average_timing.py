@@ -12,7 +12,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_avg_fn
 
 from benchmarks.perf.diffusion_case import configuration
 from benchmarks.perf.timing import Row, compare
-from extrap_train.diffusion.callbacks import AveragedModule
+from extrap_train.diffusion.averaging import AveragedModule
 from extrap_train.diffusion.model import ExtrapolationModel
 
 FULL_WIDTH = 320

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from extrap_train.config import LoraConfig, SamplerConfig
 from extrap_train.data.scene_pairs import AdaptationPairs
+from extrap_train.diffusion.averaging import move_average
 from extrap_train.diffusion.conditioning import Conditioning
 from extrap_train.diffusion.loss import Anchor, Unchanged, diffusion_loss, prediction_errors
 from extrap_train.diffusion.model import ExtrapolationModel
@@ -114,8 +115,7 @@ def adapt(
         optimizer.step()
         step += 1
         newest = _weights(adapter)
-        for name, value in average.items():
-            value.lerp_(newest[name], 1 - min(_AVERAGE_DECAY, (1 + step) / (10 + step)))
+        move_average(average.values(), newest.values(), step, _AVERAGE_DECAY)
         on_step(step, spent())
         if step % options.validate_every and step < options.steps and spent() < 1:
             continue

@@ -1,7 +1,5 @@
-"""Lightning callbacks of a training run: averaged weights, metrics table, progress bar."""
+"""What a training run reports to Lightning's hooks: its table of metrics and its progress bar."""
 
-import csv
-import io
 import math
 import time
 from collections.abc import Mapping
@@ -9,13 +7,12 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import torch
 from lightning import LightningModule, Trainer
-from lightning.pytorch.callbacks import Callback, WeightAveraging
+from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities import rank_zero_only
-from torch import nn
-from torch.optim.swa_utils import AveragedModel
 
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import write_atomic
@@ -23,47 +20,6 @@ from extrap_train.terminal import DRAWN_EVERY_S, progress
 
 ABOVE_BASELINES = "validation/above_baselines_db"
 """Of a validation's metrics, what the bar shows."""
-
-
-class AveragedWeights(WeightAveraging):
-    """Exponential moving average with a growing memory: decay min(d, (1 + n)/(10 + n)).
-
-    It lies where the model is trained; an update is one fused operation that waits for nothing.
-    """
-
-    def __init__(self, decay: float) -> None:
-        super().__init__()
-        self.decay = decay
-
-    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Make the average on the training device, to which the model itself moves later."""
-        if stage == "fit":
-            device = trainer.strategy.root_device
-            self._average_model = AveragedModule(pl_module, device, self.decay)
-
-    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Hand out the average also where a resumed run had no step left, which skips
-        `on_train_end`.
-        """
-        self._copy_average_to_current(pl_module)
-
-
-class AveragedModule(AveragedModel):
-    """The average of a model's parameters and buffers, all in single precision."""
-
-    def __init__(self, model: nn.Module, device: torch.device, decay: float) -> None:
-        super().__init__(model)
-        self.module.to(device)  # but not the count, which is read in every step
-        self.decay = decay
-
-    @torch.no_grad()
-    def update_parameters(self, model: nn.Module) -> None:
-        """Move the average towards the model; the first time, copy it."""
-        count = int(self.n_averaged)
-        decay = min(self.decay, (1 + count) / (10 + count)) if count else 0.0
-        average, current = ([*each.parameters(), *each.buffers()] for each in (self.module, model))
-        torch._foreach_lerp_(average, current, 1 - decay)
-        self.n_averaged += 1
 
 
 class MetricsTable(Logger):
@@ -75,7 +31,7 @@ class MetricsTable(Logger):
     def __init__(self, path: Path, resumed_step: int) -> None:
         super().__init__()
         self.path = path
-        self._rows = [row for row in _read(path) if int(row["step"]) <= resumed_step]
+        self._rows = [row for row in _read(path) if row["step"] <= resumed_step]
 
     @property
     def name(self) -> str:
@@ -92,39 +48,31 @@ class MetricsTable(Logger):
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         """Collect a row; rows of the same step are one."""
-        row = {name: f"{value:.6g}" for name, value in metrics.items()}
-        if self._rows and self._rows[-1]["step"] == str(step):
-            self._rows[-1] |= row
-        else:
-            self._rows.append({"step": str(step), **row})
+        assert step is not None
+        if not self._rows or self._rows[-1]["step"] != step:
+            self._rows.append({"step": step})
+        self._rows[-1] |= metrics
 
     @rank_zero_only
     def save(self) -> None:
         """Write the table whole; Lightning asks every process, and the first one has the rows."""
-        columns = list(dict.fromkeys(name for row in self._rows for name in row))
-        text = io.StringIO()
-        writer = csv.DictWriter(text, columns, restval="")
-        writer.writeheader()
-        writer.writerows(self._rows)
-        write_atomic(self.path, text.getvalue().encode())
+        table = pd.DataFrame(self._rows).to_csv(index=False, float_format="%.6g")
+        write_atomic(self.path, table.encode())
 
 
-def _read(path: Path) -> list[dict[str, str]]:
+def _read(path: Path) -> list[dict[Any, Any]]:
     if not path.is_file():
         return []
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = [{k: v for k, v in row.items() if k and v} for row in csv.DictReader(file)]
-        for row in rows:
-            for value in row.values():
-                float(value)
-            int(row["step"])
-    except (csv.Error, ValueError, KeyError, TypeError) as error:
+        table = pd.read_csv(path, dtype={"step": int}, index_col=False)
+        steps = table.pop("step")
+        rows = table.astype(float).to_dict("records")
+    except (ValueError, KeyError) as error:
+        reason = " ".join(str(error).split())
         raise InputError(
-            f"{path}: damaged ({type(error).__name__} {error}); delete it to go on without the "
-            "rows of earlier steps"
+            f"{path}: damaged ({reason}); delete it to go on without the rows of earlier steps"
         ) from None
-    return rows
+    return [{"step": step} | row for step, row in zip(steps.tolist(), rows, strict=True)]
 
 
 class StepProgress(Callback):

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from extrap_train.data.prepared import PreparedData
+from extrap_train.diffusion.callbacks import ABOVE_BASELINES
 from extrap_train.diffusion.evaluation import Prediction, summarise
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.errors import InputError
@@ -19,8 +20,6 @@ from extrap_train.runs import RunFolder, provenance
 from extrap_train.store.atomic import write_atomic
 from extrap_train.store.digests import folder_digest
 from extrap_train.store.records import write_summary
-
-_ABOVE = "validation/above_baselines_db"
 
 
 def write_results(
@@ -114,9 +113,9 @@ def draw_views(prediction: Prediction, path: Path) -> None:
 def draw_curve(folder: RunFolder) -> None:
     """How far the model was above the best baseline, over the training steps."""
     table = pd.read_csv(folder.path / "metrics.csv")
-    if _ABOVE in table:
-        rows = table[table[_ABOVE].notna()]
-        series = {"model": rows[_ABOVE].tolist(), "best baseline": [0.0] * len(rows)}
+    if ABOVE_BASELINES in table:
+        rows = table[table[ABOVE_BASELINES].notna()]
+        series = {"model": rows[ABOVE_BASELINES].tolist(), "best baseline": [0.0] * len(rows)}
         path = folder.samples / "curve.png"
         curve(rows["step"].tolist(), series, "PSNR above the best baseline, dB", path)
 

@@ -24,7 +24,7 @@ from extrap_train.data.module import PairModule
 from extrap_train.data.prepared import PreparedData
 from extrap_train.depth import DepthMap
 from extrap_train.depth.dataset import DatasetDepth
-from extrap_train.diffusion.callbacks import AveragedWeights
+from extrap_train.diffusion.averaging import AveragedWeights
 from extrap_train.diffusion.model_files import initial_model
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.jobs.local import LocalLauncher

@@ -21,7 +21,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from extrap_train.config import ModelConfig, TrainConfig
 from extrap_train.diffusion import callbacks
-from extrap_train.diffusion.callbacks import AveragedWeights, MetricsTable, StepProgress
+from extrap_train.diffusion.averaging import AveragedWeights
+from extrap_train.diffusion.callbacks import MetricsTable, StepProgress
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.errors import InputError

@@ -22,7 +22,7 @@ from benchmarks.perf.diffusion_case import (
 from benchmarks.perf.timing import Row, compare
 from benchmarks.perf.train_timing import training_step
 from extrap_train.__main__ import main
-from extrap_train.diffusion.callbacks import AveragedModule, AveragedWeights
+from extrap_train.diffusion.averaging import AveragedModule, AveragedWeights
 from extrap_train.geometry.warp import compute_warp
 from extrap_train.views import PairBatch
 

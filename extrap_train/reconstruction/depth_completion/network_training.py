@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.optim import AdamW
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from extrap_train.config import TrainerConfig
+from extrap_train.diffusion.averaging import AveragedModule
 from extrap_train.diffusion.checkpoints import WholeCheckpointIO, find_damage
 from extrap_train.diffusion.training import rate_at
 from extrap_train.errors import InputError
@@ -73,9 +73,7 @@ class DepthTraining:
         torch.manual_seed(seed)
         self.options, self.seed, self.step, self.widths = options, seed, 0, widths
         self.network = DepthNetwork(widths)
-        self.average = AveragedModel(
-            self.network, multi_avg_fn=get_ema_multi_avg_fn(options.ema_decay)
-        )
+        self.average = AveragedModule(self.network, torch.device("cpu"), options.ema_decay)
         self.optimizer = AdamW(
             self.network.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY
         )
