@@ -3,11 +3,8 @@ when a signal ends the training.
 """
 
 import os
-import pickle
 import signal
-import struct
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,6 +19,7 @@ from lightning.pytorch.callbacks import Callback
 from extrap_train.errors import InputError
 from extrap_train.exits import Terminated
 from extrap_train.store.atomic import atomic_file
+from extrap_train.weight_files import DAMAGE
 
 _KEPT = 2
 _AGREED_EVERY = 10
@@ -37,17 +35,11 @@ _ENTRIES: dict[str, type] = {
 """What Lightning cannot resume without."""
 _AVERAGE = ("current_model_state", "averaging_state")
 """Likewise, where weights are averaged; Lightning itself would go on without the average."""
-_DAMAGE = (
-    OSError, RuntimeError, EOFError, ValueError, LookupError, AttributeError, TypeError,
-    AssertionError, MemoryError, OverflowError, struct.error, zipfile.BadZipFile, zlib.error,
-    pickle.UnpicklingError,
-)  # fmt: skip
-"""What readers of zip archives and pickles raise on damaged ones."""
 _PIECE_BYTES = 2**20
 
 
 class WholeCheckpointIO(TorchCheckpointIO):
-    """Writes a checkpoint complete or not at all, and loads it without running any code from it."""
+    """Writes a checkpoint complete or not at all."""
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: Any = None
@@ -66,21 +58,6 @@ class WholeCheckpointIO(TorchCheckpointIO):
                     f"{path}: cannot be written ({reason}); free space or choose another output="
                 ) from None
 
-    def load_checkpoint(
-        self,
-        path: str | os.PathLike[str],
-        map_location: Any = lambda storage, location: storage,
-        weights_only: bool | None = True,
-    ) -> dict[str, Any]:
-        """Load tensors and plain values only; InputError if the file is damaged or holds others."""
-        if (damage := find_damage(Path(path))) is not None:
-            raise InputError(
-                f"{path}: cannot be resumed from ({damage}); delete it to resume from the "
-                "checkpoint before it"
-            )
-        loaded: dict[str, Any] = torch.load(path, map_location=map_location, weights_only=True)
-        return loaded
-
 
 def find_damage(path: Path, entries: Mapping[str, type] = _ENTRIES) -> str | None:
     """What is wrong with a checkpoint: a checksum, its format, or an entry that it lacks.
@@ -96,7 +73,7 @@ def find_damage(path: Path, entries: Mapping[str, type] = _ENTRIES) -> str | Non
                     while content.read(_PIECE_BYTES):
                         pass  # the reader compares the checksum at the end
         found = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except _DAMAGE as error:
+    except DAMAGE as error:
         return f"{type(error).__name__} {error}".splitlines()[0]
     if not isinstance(found, dict):
         return "it holds no mapping"
@@ -144,14 +121,11 @@ def restoring(checkpoint: str | None, has_begun: Callable[[], bool]) -> Iterator
         yield
     except InputError:
         raise
-    except _DAMAGE as error:
+    except DAMAGE as error:
         if checkpoint is None or has_begun():
             raise
         reason = f"{type(error).__name__} {error}".splitlines()[0]
-        raise InputError(
-            f"{checkpoint}: cannot be resumed from ({reason}); delete it to resume from the "
-            "checkpoint before it"
-        ) from error
+        raise _unusable(checkpoint, reason) from error
 
 
 class _Stop(BaseException):
@@ -282,7 +256,11 @@ def _require_fitting_moments(trainer: Trainer) -> None:
                     and value.ndim
                     and value.shape != parameter.shape
                 ):
-                    raise InputError(
-                        f"{trainer.ckpt_path}: cannot be resumed from (its {name} is of another "
-                        "shape); delete it to resume from the checkpoint before it"
-                    )
+                    raise _unusable(trainer.ckpt_path, f"its {name} is of another shape")
+
+
+def _unusable(checkpoint: object, reason: str) -> InputError:
+    return InputError(
+        f"{checkpoint}: cannot be resumed from ({reason}); delete it to resume from the "
+        "checkpoint before it"
+    )
