@@ -1,6 +1,6 @@
 """Scores of a model and of the baselines on the same held-out examples."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import pandas as pd
@@ -37,14 +37,14 @@ def baseline_images(batch: PairBatch) -> dict[str, Float[Tensor, "b 3 h w"]]:
 
 def predict(
     model: ExtrapolationModel,
-    batches: Iterable[tuple[PairBatch, list[str]]],
+    batch: PairBatch,
+    names: list[str],
     sampler: SamplerConfig,
     seed: int,
-) -> Iterator[Prediction]:
-    """The model's sample and the baselines for every batch; one seed per view, by its name."""
-    for batch, names in batches:
-        made = sample_views(model, batch, sampler, names, seed)
-        yield Prediction(batch, names, {"model": made, **baseline_images(batch)})
+) -> Prediction:
+    """The model's sample and the baselines for a batch; one seed per view, by its name."""
+    made = sample_views(model, batch, sampler, names, seed)
+    return Prediction(batch, names, {"model": made, **baseline_images(batch)})
 
 
 def score(prediction: Prediction, lpips: Distance | None) -> pd.DataFrame:

@@ -11,8 +11,6 @@ The published families keep pose and warp in the null condition, because their t
 dropped these.
 """
 
-from typing import Protocol, runtime_checkable
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -32,73 +30,53 @@ from extrap_train.geometry.resample import lanczos_resize
 from extrap_train.views import PairBatch, Warp
 
 
-@runtime_checkable
-class Family(Protocol):
-    """One family; the batch that it is given must hold its warp."""
+class Family:
+    """One family; as it stands, `zeronvs` (Sargent et al. 2024), which is told the pose alone: the
+    network has to imagine the query from the reference.
+
+    The batch that it is given must hold its warp.
+    """
 
     def channels(self, latent_channels: int, config: ModelConfig) -> int:
         """How many channels stand behind the noisy latent."""
-        ...
-
-    def latents(
-        self, batch: PairBatch, autoencoder: Autoencoder, config: ModelConfig
-    ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b z h w"]]:
-        """These channels, and the latent that the denoised one is relative to."""
-        ...
-
-    def pose(self, batch: PairBatch) -> Float[Tensor, "b 19"]:
-        """The query's pose relative to the nearest reference."""
-        ...
-
-    def null(self, latent_channels: int, embedding_width: int) -> Null:
-        """What the null condition takes away of latents and embedding."""
-        ...
-
-
-class ZeroNvs:
-    """Pose only (Sargent et al. 2024): the network has to imagine the query from the reference."""
-
-    def channels(self, latent_channels: int, config: ModelConfig) -> int:
-        """See `Family.channels`."""
         return latent_channels
 
     def latents(
         self, batch: PairBatch, autoencoder: Autoencoder, config: ModelConfig
     ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b z h w"]]:
-        """See `Family.latents`."""
+        """These channels, and the latent that the denoised one is relative to."""
         reference = autoencoder.encode_reference(batch.reference_images[:, 0])
         return reference, torch.zeros_like(reference)
 
     def pose(self, batch: PairBatch) -> Float[Tensor, "b 19"]:
-        """See `Family.pose`."""
-        return _zeronvs_pose(batch)
+        """The query's pose relative to the nearest reference."""
+        return zeronvs_pose(batch.reference_cameras[:, 0], batch.camera, _zeronvs_scale(batch))
 
     def null(self, latent_channels: int, embedding_width: int) -> Null:
-        """See `Family.null`."""
+        """What the null condition takes away of latents and embedding."""
         return Null(latent_channels, embedding_width)
 
 
-class MegaScenes:
-    """Pose and the nearest reference's warp (Tung et al. 2024), black in its holes.
+class MegaScenes(Family):
+    """Also the nearest reference's warp (Tung et al. 2024), black in its holes.
 
     With `residual` the denoised latent is relative to that warp, its holes filled; the published
     model has `residual: false`.
     """
 
     def channels(self, latent_channels: int, config: ModelConfig) -> int:
-        """See `Family.channels`."""
+        """The warp is not encoded but shrunk to the latents' size: three colours."""
         return latent_channels + 3
 
     def latents(
         self, batch: PairBatch, autoencoder: Autoencoder, config: ModelConfig
     ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b z h w"]]:
-        """See `Family.latents`; the warp is not encoded but shrunk to the latents' size."""
-        reference = autoencoder.encode_reference(batch.reference_images[:, 0])
+        """See `Family.latents`."""
+        reference, base = super().latents(batch, autoencoder, config)
         warp = _nearest_warp(batch)
         # What is no network keeps its precision where the caller lets the network run in less.
         with torch.autocast(reference.device.type, enabled=False):
             shrunk = lanczos_resize(warp.image, *reference.shape[-2:]).clamp(0, 1) * 2 - 1
-        base = torch.zeros_like(reference)
         if config.residual:
             base = autoencoder.encode(filled_warp(warp))
         return torch.cat([reference, shrunk], 1), base
@@ -111,12 +89,8 @@ class MegaScenes:
             depth_scale(batch.reference_depths[:, 0], every=1, least=1e-7),
         )
 
-    def null(self, latent_channels: int, embedding_width: int) -> Null:
-        """See `Family.null`."""
-        return Null(latent_channels, embedding_width)
 
-
-class Ours:
+class Ours(Family):
     """The fused warp of several references with its positional encoding."""
 
     def channels(self, latent_channels: int, config: ModelConfig) -> int:
@@ -133,12 +107,8 @@ class Ours:
             latents = torch.cat([latents, told], 1)
         return latents, warped if config.residual else torch.zeros_like(warped)
 
-    def pose(self, batch: PairBatch) -> Float[Tensor, "b 19"]:
-        """See `Family.pose`."""
-        return _zeronvs_pose(batch)
-
     def null(self, latent_channels: int, embedding_width: int) -> Null:
-        """See `Family.null`."""
+        """Everything."""
         return Null()
 
 
@@ -152,11 +122,7 @@ def _nearest_warp(batch: PairBatch) -> Warp:
     return warp_of(batch)
 
 
-FAMILIES: dict[str, Family] = {"zeronvs": ZeroNvs(), "megascenes": MegaScenes(), "ours": Ours()}
-
-
-def _zeronvs_pose(batch: PairBatch) -> Float[Tensor, "b 19"]:
-    return zeronvs_pose(batch.reference_cameras[:, 0], batch.camera, _zeronvs_scale(batch))
+FAMILIES: dict[str, Family] = {"zeronvs": Family(), "megascenes": MegaScenes(), "ours": Ours()}
 
 
 def _zeronvs_scale(batch: PairBatch) -> Float[Tensor, " b"]:

@@ -136,10 +136,7 @@ def noise_schedule(config: ModelConfig) -> DDIMScheduler:
     With zero terminal SNR (Lin et al. 2023) the last step is pure noise, so sampling starts where
     training ended ("trailing"); an ε-prediction carries no information there and is refused.
     """
-    if config.zero_terminal_snr and config.prediction == "epsilon":
-        raise ValueError(
-            "zero terminal SNR needs model.prediction=v_prediction or sample, not epsilon"
-        )
+    assert config.prediction != "epsilon" or not config.zero_terminal_snr
     return DDIMScheduler(
         num_train_timesteps=1000,
         beta_start=0.00085,

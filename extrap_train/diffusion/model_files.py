@@ -221,10 +221,8 @@ def _lacks_geometry(path: Path, config: ModelConfig) -> bool:
     """Whether all that a saved model's denoiser is not told is the warp's depth and confidence;
     published ones never were.
     """
-    if not (path / MODEL_CONFIG).is_file():
-        return False
-    saved = saved_config(path)
-    return not saved.geometry and saved.octaves == config.octaves
+    saved = saved_config(path) if is_own(path) else None
+    return saved is not None and not saved.geometry and saved.octaves == config.octaves
 
 
 def _untrained(family: str, conv_in: Tensor, config: ModelConfig) -> str:

@@ -72,8 +72,8 @@ class CategoryTraining(lightning.LightningModule):
         """Sample the batch's queries."""
         of_all = len(self.validation_names)
         index = shard(of_all, self.global_rank, self.trainer.world_size)[batch_idx]
-        named = [(batch, self.validation_names[index])]
-        made = next(predict(self.model, named, self.sampler, self.config.seed))
+        names = self.validation_names[index]
+        made = predict(self.model, batch, names, self.sampler, self.config.seed)
         if not made.images["model"].isfinite().all():
             raise InputError(
                 f"step {self.global_step}: sampled views hold values that are not numbers: lower "
