@@ -1,26 +1,23 @@
 """A scene's adapter: low-rank additions to a denoiser's layers, saved apart from its weights."""
 
 import hashlib
-import shlex
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import peft
 import torch
 from pydantic import Field
-from safetensors import SafetensorError
 from torch import Tensor, nn
 
 from extrap_train.config import LoraConfig
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError
-from extrap_train.store.atomic import write_atomic
 from extrap_train.store.digests import file_digest
 from extrap_train.store.records import read_record, write_record
-from extrap_train.weight_files import WeightFile
+from extrap_train.weight_files import WeightFile, write_tensors
 
 _ATTENTION = ["to_q", "to_k", "to_v", "to_out.0"]
 _CONVOLUTIONS = ["conv1", "conv2"]
@@ -28,7 +25,6 @@ _WEIGHTS = "adapter_model.safetensors"
 _OPTIONS = "adapter_config.json"
 _BASE = "base.json"
 """An `AdapterRecord`, next to peft's files."""
-_CARD = "README.md"
 _REMEDY = "{} is no adapter folder of task=scene, or is damaged: make it again"
 _MAX_RANK = 1024
 
@@ -45,10 +41,6 @@ class AdapterOrigin:
     """SHA-256 of the content of the frames that it was trained on, by their names."""
     weights: str
     """Model folder, or a packaged model's name."""
-    options: Mapping[str, Any]
-    """By dotted key."""
-    outcome: str
-    """How its training ended."""
 
 
 @dataclass(frozen=True)
@@ -113,16 +105,12 @@ def save_adapter(
     File by file: that all of it appears at once is for the result that it is part of. Raises
     InputError if the disk is full or closed.
     """
-    try:
-        adapter.save_pretrained(str(folder))
-    except (OSError, SafetensorError) as error:
-        raise InputError(
-            f"{folder}: cannot be written ({error}); free space or choose another folder"
-        ) from None
+    write_tensors(peft.get_peft_model_state_dict(adapter), folder / _WEIGHTS)
+    adapter.peft_config["default"].save_pretrained(str(folder))
     tensors = file_digest(folder / _WEIGHTS)
-    record = AdapterRecord(**vars(origin), base=base_hashes(model), tensors=tensors)
-    write_record(folder / _BASE, record)
-    write_atomic(folder / _CARD, _model_card(record).encode())
+    write_record(
+        folder / _BASE, AdapterRecord(**vars(origin), base=base_hashes(model), tensors=tensors)
+    )
 
 
 def adapter_bytes(adapter: peft.PeftModel) -> int:
@@ -147,7 +135,6 @@ def load_adapter(model: ExtrapolationModel, folder: Path) -> peft.PeftModel:
             f"adapter={folder}: was trained on other weights than these; give the weights= it was "
             "made for, or adapt these with task=scene"
         )
-    _require_rank(options, weights, folder / _OPTIONS, remedy)
     config = peft.LoraConfig(
         r=options.r,
         lora_alpha=options.lora_alpha,
@@ -166,29 +153,6 @@ def load_adapter(model: ExtrapolationModel, folder: Path) -> peft.PeftModel:
     return adapter
 
 
-def _model_card(record: AdapterRecord) -> str:
-    """The `README.md` of an adapter's folder."""
-    rows = {
-        "scene": f"`{record.scene}`",
-        "photographs": ", ".join(f"`{name}`" for name in record.photographs),
-        "weights": f"`{record.weights}`",
-        "SHA-256 of the denoiser": f"`{record.base.denoiser}`",
-        "SHA-256 of its other networks": f"`{record.base.others}`",
-        "training": record.outcome,
-        "options": ", ".join(f"`{name}={value}`" for name, value in record.options.items()),
-    }
-    options = {
-        "weights": record.weights,
-        "scene": record.scene,
-        "input_frames": f"[{','.join(record.photographs)}]",
-    }
-    return _CARD_TEXT.format(
-        rows="\n".join(f"| {name} | {value} |" for name, value in rows.items()),
-        command=" ".join(shlex.quote(f"{name}={value}") for name, value in options.items()),
-        weights=record.weights,
-    )
-
-
 def _read_tensors(file: Path, sha256: str, remedy: str) -> dict[str, Tensor]:
     """A safetensors file, which holds nothing but tensors of the size that the file has."""
     weights = WeightFile(file, None, remedy)
@@ -196,21 +160,6 @@ def _read_tensors(file: Path, sha256: str, remedy: str) -> dict[str, Tensor]:
     if file_digest(file) != sha256:
         raise InputError(f"{file}: was changed since it was saved; {remedy}")
     return tensors
-
-
-def _require_rank(
-    options: _SavedOptions, weights: Mapping[str, Tensor], file: Path, remedy: str
-) -> None:
-    """InputError unless the tensors have the rank that the options say, before memory of that
-    size is asked for.
-    """
-    ranks = {x.shape[0] for name, x in weights.items() if ".lora_A." in name and x.ndim > 1}
-    if ranks != {options.r} or options.lora_alpha != options.r:
-        found = ", ".join(map(str, sorted(ranks)[:3])) or "no"
-        raise InputError(
-            f"{file}: r is {options.r} and lora_alpha {options.lora_alpha}, but its tensors have "
-            f"rank {found}; {remedy}"
-        )
 
 
 def base_hashes(model: ExtrapolationModel) -> BaseHashes:
@@ -231,36 +180,3 @@ def _hash(networks: Iterable[nn.Module]) -> str:
                 digest.update(name.replace(".base_layer", "").encode())
                 digest.update(value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy())
     return digest.hexdigest()
-
-
-_CARD_TEXT = """---
-library_name: peft
-tags:
-- lora
-- novel-view-synthesis
----
-# An adapter for one scene
-
-Low-rank additions to the denoiser of a view-extrapolation model, trained on photographs of one
-scene alone. It generates new views of that scene; other scenes may come out worse than without it.
-
-| | |
-|---|---|
-{rows}
-
-`base.json` says the same for programs. The adapter is refused on other weights than these.
-
-## Use
-
-```bash
-python -m extrap_train task=view category=NAME {command} orbit=360 adapter=FOLDER
-```
-
-```python
-from extrap_train import open_generator
-
-generator = open_generator({weights!r}, adapter="FOLDER")
-```
-
-Any `category` will do. In plain peft: `PeftModel.from_pretrained(unet, "FOLDER")`.
-"""

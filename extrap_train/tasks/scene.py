@@ -135,7 +135,7 @@ def _run(
             on_step=on_step,
         )
     after = _generate(model, config, inputs, targets)
-    origin = _origin(config, sequence, inputs, used, done)
+    origin = _origin(config, sequence, inputs, used)
     with result.replace() as whole:
         save_adapter(model, adapter, whole / "adapter", origin)
         measured = _measure(before, after, targets, whole, distance)
@@ -169,16 +169,12 @@ def _origin(
     sequence: FrameSequence,
     inputs: SceneInputs,
     used: UsedWeights,
-    done: Adaptation,
 ) -> AdapterOrigin:
-    options = {"lora": asdict(config.lora), "minutes": config.minutes, "seed": config.seed}
     learnt = {view.name for view in inputs.views}
     return AdapterOrigin(
         scene=scene_address(required_scene(config)),
         photographs=photograph_digests(f for f in sequence.frames if f.name in learnt),
         weights=used.name,
-        options=dotted(options),
-        outcome=_describe_end(done),
     )
 
 

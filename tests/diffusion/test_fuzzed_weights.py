@@ -145,7 +145,7 @@ def _model_folder(config: ModelConfig, folder: Path) -> Callable[[], Any]:
 def _adapter_folder(config: ModelConfig, folder: Path) -> Callable[[], Any]:
     model = _tiny(config)
     adapter = add_adapter(model, LoraConfig(rank=2), seed=0)
-    origin = AdapterOrigin("/scene", {"a.jpg": "0" * 64}, "base", {}, "kept step 1 of 1")
+    origin = AdapterOrigin("/scene", {"a.jpg": "0" * 64}, "base")
     save_adapter(model, adapter, folder, origin)
     adapter.unload()
     return lambda: load_adapter(model, folder)

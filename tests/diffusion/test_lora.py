@@ -27,9 +27,7 @@ from extrap_train.views import PairBatch
 OPTIONS = LoraConfig(rank=2, convolutions=True, steps=12, validate_every=4, batch_size=4)
 
 
-ORIGIN = AdapterOrigin(
-    "/scenes/apple", {"a.jpg": "ab", "b.jpg": "cd"}, "ours-apple", {"lora.rank": 2}, "kept step 4"
-)
+ORIGIN = AdapterOrigin("/scenes/apple", {"a.jpg": "ab", "b.jpg": "cd"}, "ours-apple")
 
 
 def _generated(model: ExtrapolationModel, batch: PairBatch) -> Tensor:
@@ -111,18 +109,7 @@ def test_an_adapter_says_what_it_was_made_from(config: ModelConfig, tmp_path: Pa
     save_adapter(model, _randomised(model), folder, ORIGIN)
     record = read_adapter_record(folder)
     assert vars(ORIGIN).items() <= vars(record).items()
-    card = (folder / "README.md").read_text()
-    assert "More Information Needed" not in card
-    hashes = base_hashes(model)
-    for said in (
-        "/scenes/apple",
-        "`a.jpg`, `b.jpg`",
-        "ours-apple",
-        hashes.denoiser,
-        hashes.others,
-        "rank=2",
-    ):
-        assert said in card
+    assert record.base == base_hashes(model)
 
 
 @pytest.mark.parametrize("changed", ["flip", "cut", "gone", "folder"])
@@ -147,11 +134,10 @@ def test_an_adapter_whose_tensors_were_changed_is_refused(
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"r": 3}, "r is 3"),
+        ({"r": 3}, "tensors do not fit"),
         ({"r": 0}, "r: "),
         ({"r": 10**9, "lora_alpha": 10**9}, "r: "),
         ({"lora_alpha": int("9" * 400)}, "lora_alpha: "),
-        ({"lora_alpha": 3}, "lora_alpha 3"),
         ({"r": "many"}, "r: "),
         ({"r": True}, "r: "),
         ({"peft_type": "IA3"}, "peft_type: "),

@@ -124,7 +124,7 @@ def _adapter(folder: Path) -> Callable[[], object]:
     torch.manual_seed(0)
     model = ExtrapolationModel(_TINY)
     adapter = add_adapter(model, LoraConfig(rank=2), seed=0)
-    origin = AdapterOrigin("synthetic:cup/0000", {"a": "b"}, "base", {"lora.rank": 2}, "kept")
+    origin = AdapterOrigin("synthetic:cup/0000", {"a": "b"}, "base")
     save_adapter(model, adapter, folder, origin)
     adapter.unload()
     return lambda: load_adapter(model, folder).unload()

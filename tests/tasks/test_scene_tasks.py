@@ -258,7 +258,7 @@ def _adapter_of(weights: Path, folder: Path, *frames: str) -> Path:
     options = SyntheticConfig(frames=8, image_size=32)
     known = {frame.name: frame for frame in open_scene("synthetic:hydrant/0000", options).frames}
     learnt = {name: frame_digest(known[name]) for name in frames}
-    origin = AdapterOrigin("synthetic:hydrant/0000", learnt, str(weights), {}, "")
+    origin = AdapterOrigin("synthetic:hydrant/0000", learnt, str(weights))
     save_adapter(model, adapter, folder, origin)
     return folder
 
