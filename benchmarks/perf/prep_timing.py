@@ -34,7 +34,7 @@ def run() -> list[Row]:
     torch.set_num_threads(1)
     numba.set_num_threads(1)
     try:
-        with LocalLauncher(1, apart=True) as one, LocalLauncher(2) as two:
+        with LocalLauncher(1) as one, LocalLauncher(2) as two:
             synthesize(DATA, CATEGORY, folder / "captures", two)
             sequences = read_category(folder / "captures", CATEGORY)
 

@@ -10,13 +10,13 @@ from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
 from multiprocessing.connection import wait as wait_for_any
 from types import TracebackType
+from typing import Any
 
 from extrap_train.jobs import ONE_THREAD, Died, Item, Result
 from extrap_train.jobs.fork_server import start_fork_server
 
 WAITING_PER_WORKER = 2
 """Jobs that are handed out ahead of time: memory must not grow with the number of jobs."""
-_NO_MEMORY = "out of memory ({})"
 
 
 class LocalLauncher:
@@ -24,12 +24,11 @@ class LocalLauncher:
 
     A context manager: the pool starts with the first jobs, serves any number of runs, and ends
     with the context, at once where it ends with an exception. No worker outlives its parent,
-    however that ends. `apart` keeps jobs out of
-    this process even where one worker would do, so that one that dies takes only itself along.
+    however that ends.
     """
 
-    def __init__(self, workers: int, apart: bool = False) -> None:
-        self.workers, self.apart = workers, apart
+    def __init__(self, workers: int) -> None:
+        self.workers = workers
         self._pool: ProcessPoolExecutor | None = None
         self._stay: Connection | None = None
         """Workers leave at once when it is closed."""
@@ -51,36 +50,33 @@ class LocalLauncher:
         self, job: Callable[[Item], Result], items: Sequence[Item]
     ) -> Iterator[tuple[int, Result | Died]]:
         """See `Launcher`."""
-        suspects: dict[int, str] = {}
-        here = not self.apart and (self.workers == 1 or len(items) <= 1)
-        run = self._run_here if here else self._run_in_pool
-        yield from run(job, items, suspects)
-        if suspects:
-            self._close()  # its idle processes hold memory, too
-        for index in suspects:
-            again: dict[int, str] = {}
-            with LocalLauncher(2) as alone:
-                yield from (
-                    (index, result) for _, result in alone._run_in_pool(job, [items[index]], again)
-                )
-            yield from ((index, Died(reason)) for reason in again.values())
-
-    def _run_here(
-        self, job: Callable[[Item], Result], items: Sequence[Item], suspects: dict[int, str]
-    ) -> Iterator[tuple[int, Result]]:
-        """What has no memory goes to `suspects`, with its reason."""
-        for index, item in enumerate(items):
-            try:
-                result = job(item)
-            except MemoryError as error:
-                suspects[index] = _NO_MEMORY.format(error)
+        run = self._run_here if self.workers == 1 or len(items) <= 1 else self._run_in_pool
+        died = []
+        for index, result in run(job, items):
+            if isinstance(result, Died):
+                died.append(index)
             else:
                 yield index, result
+        if died:
+            self._close()  # its idle processes hold memory, too
+        for index in died:
+            with LocalLauncher(2) as alone:
+                ((_, result),) = alone._run_in_pool(job, [items[index]])
+            yield index, result
+
+    def _run_here(
+        self, job: Callable[[Item], Result], items: Sequence[Item]
+    ) -> Iterator[tuple[int, Result | Died]]:
+        for index, item in enumerate(items):
+            try:
+                yield index, job(item)
+            except MemoryError as error:
+                yield index, Died(f"out of memory ({error})")
 
     def _run_in_pool(
-        self, job: Callable[[Item], Result], items: Sequence[Item], suspects: dict[int, str]
-    ) -> Iterator[tuple[int, Result]]:
-        """What was under way when a process died goes to `suspects`, too."""
+        self, job: Callable[[Item], Result], items: Sequence[Item]
+    ) -> Iterator[tuple[int, Result | Died]]:
+        """What was under way when a process died has died, too."""
         running: dict[Future[Result], int] = {}
         waiting = iter(range(len(items)))
         try:
@@ -93,14 +89,7 @@ class LocalLauncher:
                     return
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
                     index = running.pop(future)
-                    try:
-                        result = future.result()
-                    except BrokenProcessPool:
-                        suspects[index] = "its process was killed, probably for want of memory"
-                    except MemoryError as error:
-                        suspects[index] = _NO_MEMORY.format(error)
-                    else:
-                        yield index, result
+                    yield index, _result_of(future)
         finally:
             for future in running:
                 future.cancel()
@@ -126,6 +115,16 @@ class LocalLauncher:
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
             self._pool = None
+
+
+def _result_of(future: "Future[Any]") -> Any:
+    """A job's result, or why its process has none."""
+    try:
+        return future.result()
+    except BrokenProcessPool:
+        return Died("its process was killed, probably for want of memory")
+    except MemoryError as error:
+        return Died(f"out of memory ({error})")
 
 
 def _prepare_worker(leave: Connection, environment: Mapping[str, str]) -> None:

@@ -21,30 +21,34 @@ class SubmittedLauncher:
     cancels the tasks; killed, they go on, and the same command later finds what they made.
     """
 
-    def __init__(self, executor: Any, tasks: int, poll_seconds: float = 5.0) -> None:
-        self.executor, self.tasks, self.poll_seconds = executor, tasks, poll_seconds
+    def __init__(
+        self, open_executor: Callable[[], Any], tasks: int, poll_seconds: float = 5.0
+    ) -> None:
+        self.open_executor, self.tasks, self.poll_seconds = open_executor, tasks, poll_seconds
+
+    @cached_property
+    def _executor(self) -> Any:
+        """Opened for the first jobs: often there are none."""
+        return self.open_executor()
 
     def run(
         self, job: Callable[[Item], Result], items: Sequence[Item]
     ) -> Iterator[tuple[int, Result | Died]]:
         """See `Launcher`."""
         dealt = [list(range(first, len(items), self.tasks)) for first in range(self.tasks)]
-        suspects: dict[int, str] = {}
-        yield from self._run_shares(job, items, dealt, suspects)
-        alone = [[index] for index in suspects]
+        alone = []
+        for index, result in self._run_shares(job, items, dealt):
+            if isinstance(result, Died):
+                alone.append([index])
+            else:
+                yield index, result
         for start in range(0, len(alone), self.tasks):
-            died: dict[int, str] = {}
-            yield from self._run_shares(job, items, alone[start : start + self.tasks], died)
-            yield from ((index, Died(reason)) for index, reason in died.items())
+            yield from self._run_shares(job, items, alone[start : start + self.tasks])
 
     def _run_shares(
-        self,
-        job: Callable[[Item], Result],
-        items: Sequence[Item],
-        shares: Sequence[list[int]],
-        died: dict[int, str],
-    ) -> Iterator[tuple[int, Result]]:
-        """One array task a share; what ended without a result goes to `died`, with its reason."""
+        self, job: Callable[[Item], Result], items: Sequence[Item], shares: Sequence[list[int]]
+    ) -> Iterator[tuple[int, Result | Died]]:
+        """One array task a share; all of it has died where the task ends without a result."""
         from submitit.core.utils import (
             FailedJobError,
             FailedSubmissionError,
@@ -57,7 +61,7 @@ class SubmittedLauncher:
             return
         parts = [[items[index] for index in share] for share in shares]
         try:
-            submitted = self.executor.map_array(_run_share, [job] * len(parts), parts)
+            submitted = self._executor.map_array(_run_share, [job] * len(parts), parts)
         except (FailedJobError, FailedSubmissionError) as error:
             said = " ".join(str(error).split()) or "it said nothing"
             raise InputError(
@@ -72,15 +76,10 @@ class SubmittedLauncher:
                     results = task.result()
                 except UncompletedJobError:
                     reason = f"its SLURM task ended early; see {task.paths.stderr}"
-                    died |= dict.fromkeys(share, reason)
-                    continue
+                    results = [Died(reason)] * len(share)
                 if isinstance(results, BaseException):
                     raise results
-                for index, result in zip(share, results, strict=True):
-                    if isinstance(result, Died):
-                        died[index] = result.reason
-                    else:
-                        yield index, result
+                yield from zip(share, results, strict=True)
         finally:
             for task in submitted:
                 if not task.done():
@@ -106,8 +105,12 @@ def _run_share(
 def slurm_launcher(config: SlurmConfig, folder: Path) -> SubmittedLauncher:
     """A launcher for the cluster that this machine submits to; logs and results go to `folder`.
 
-    Raises InputError where submitit or SLURM is not there.
+    With its first jobs it raises InputError where submitit or SLURM is not there.
     """
+    return SubmittedLauncher(lambda: _open_slurm(config, folder), config.tasks)
+
+
+def _open_slurm(config: SlurmConfig, folder: Path) -> Any:
     try:
         import submitit
     except ImportError:
@@ -133,24 +136,7 @@ def slurm_launcher(config: SlurmConfig, folder: Path) -> SubmittedLauncher:
         additional_parameters=dict(config.directives),
         **{name: value for name, value in optional.items() if value is not None},
     )
-    return SubmittedLauncher(executor, config.tasks)
-
-
-class _WhenNeeded:
-    """A cluster's launcher, which is asked for with the first jobs: often there are none."""
-
-    def __init__(self, config: SlurmConfig, folder: Path) -> None:
-        self.config, self.folder = config, folder
-
-    def run(
-        self, job: Callable[[Item], Result], items: Sequence[Item]
-    ) -> Iterator[tuple[int, Result | Died]]:
-        """See `Launcher`."""
-        yield from self._opened.run(job, items)
-
-    @cached_property
-    def _opened(self) -> Launcher:
-        return slurm_launcher(self.config, self.folder)
+    return executor
 
 
 @contextmanager
@@ -164,6 +150,6 @@ def open_launcher(config: LauncherConfig, workers: int, folder: Path) -> Iterato
             with LocalLauncher(workers) as local:
                 yield local
         case SlurmConfig():
-            yield _WhenNeeded(config, folder)
+            yield slurm_launcher(config, folder)
         case _:
             raise InputError(f"launcher={config.name}: unknown; choose local or slurm")

@@ -285,7 +285,7 @@ def test_a_cluster_makes_the_same_table(own: Path, finished: Path, tmp_path: Pat
 
     executor = submitit.LocalExecutor(tmp_path / "submitted")
     executor.update_parameters(timeout_min=30)
-    launcher = SubmittedLauncher(executor, tasks=1, poll_seconds=0.05)
+    launcher = SubmittedLauncher(lambda: executor, tasks=1, poll_seconds=0.05)
     assert run_greys(own, tmp_path, launcher=launcher) == 0
     pd.testing.assert_frame_equal(_table(tmp_path), _table(finished))
     assert _pictures(tmp_path) == _pictures(finished)

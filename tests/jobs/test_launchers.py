@@ -49,7 +49,7 @@ def square_or_fill_the_memory(item: tuple[int, str]) -> int:
 def submitted(folder: Path, tasks: int) -> SubmittedLauncher:
     import submitit
 
-    return SubmittedLauncher(submitit.LocalExecutor(folder), tasks, poll_seconds=0.05)
+    return SubmittedLauncher(lambda: submitit.LocalExecutor(folder), tasks, poll_seconds=0.05)
 
 
 @pytest.fixture(autouse=True)
@@ -175,4 +175,4 @@ def test_a_machine_without_slurm_is_one_line(
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(InputError, match=r"no sbatch on this machine; .*launcher=local"):
-        slurm_launcher(SlurmConfig(), tmp_path)
+        list(slurm_launcher(SlurmConfig(), tmp_path).run(square, [1]))
