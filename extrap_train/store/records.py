@@ -18,7 +18,6 @@ from extrap_train.store.atomic import write_atomic
 T = TypeVar("T")
 
 MAX_RECORD_BYTES = 64 * 2**20
-MAX_YAML_BYTES = 2**18
 
 
 def write_record(path: Path, record: object) -> None:
@@ -60,30 +59,14 @@ def read_record(path: Path, kind: type[T], remedy: str) -> T:
         raise InputError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
 
 
-class _PlainLoader(yaml.SafeLoader):
-    """Refuses aliases, with which a kilobyte stands for gigabytes or contains itself."""
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        if self.check_event(yaml.AliasEvent):
-            raise yaml.YAMLError("aliases are not allowed")
-        return super().compose_node(parent, index)
-
-
 def read_yaml(path: Path, remedy: str) -> dict[str, Any]:
-    """The mapping in a YAML file as plain values: no tags, aliases or interpolations have effect.
+    """The mapping in a YAML file as plain values.
 
-    Raises InputError, which ends with `remedy`, for anything else, for deep nesting and for a file
-    larger than `MAX_YAML_BYTES`.
+    Raises InputError, which ends with `remedy`, for anything else.
     """
     try:
-        if path.stat().st_size > MAX_YAML_BYTES:
-            raise InputError(f"{path}: unreadable (larger than any options file); {remedy}")
-        content = yaml.load(path.read_text(encoding="utf-8"), _PlainLoader)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
-    except RecursionError:
-        raise InputError(f"{path}: unreadable (nested too deeply); {remedy}") from None
-    except (yaml.YAMLError, ValueError) as error:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: unreadable ({reason}); {remedy}") from None
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):

@@ -22,7 +22,8 @@ from extrap_train.device import (
     trainer_device,
     trainer_precision,
 )
-from extrap_train.diffusion.callbacks import AveragedWeights, MetricsTable, StepProgress
+from extrap_train.diffusion.averaging import AveragedWeights
+from extrap_train.diffusion.callbacks import MetricsTable, StepProgress
 from extrap_train.diffusion.checkpoints import (
     Checkpoints,
     WholeCheckpointIO,
@@ -105,7 +106,6 @@ def _opened(
     with claim(folder.path, manifest, resume=resume) as claimed:
         if not claimed.is_reused:
             claimed.begin()
-        require_same_options(folder, config)  # another process may have finished it meanwhile
         opening = _opening(folder, config, console)
         if not opening.is_finished:
             write_options(folder, config, at_least=_resumed_step(opening.checkpoint))
