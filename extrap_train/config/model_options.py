@@ -96,7 +96,6 @@ class SamplerOptions:
     guidance: float | None = unset(SamplerConfig, "guidance")
     guidance_rescale: float | None = unset(SamplerConfig, "guidance_rescale")
     compat: str | None = unset(SamplerConfig, "compat")
-    without: list[str] = option([], "recommendations of the model to leave out", known=("compat",))
 
     def over(self, recommended: SamplerConfig) -> SamplerConfig:
         """The model's recommendation, overridden by the options that are set here.
@@ -104,9 +103,8 @@ class SamplerOptions:
         Asked for another solver than DDIM, it leaves out what is recommended for DDIM alone.
         """
         chosen = {name: value for name, value in vars(self).items() if value is not None}
-        left_out: dict[str, Any] = dict.fromkeys(chosen.pop("without"))
-        if chosen.get("solver", "ddim") != "ddim":
-            left_out |= {"eta": 0.0, "compat": None}
+        is_ddim = chosen.get("solver", "ddim") == "ddim"
+        left_out: dict[str, Any] = {} if is_ddim else {"eta": 0.0, "compat": None}
         return replace(recommended, **(left_out | chosen))
 
 

@@ -11,7 +11,6 @@ from benchmarks.methods.diffusion import Diffusion
 from extrap_train import open_generator
 from extrap_train.cli import register_schemas
 from extrap_train.config import ModelConfig, SamplerConfig, TrainConfig, UNetConfig, sampler_for
-from extrap_train.config.options import check_options
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.model_files import load_model, save_model
 from extrap_train.diffusion.training import CategoryTraining
@@ -73,15 +72,6 @@ def test_what_is_asked_for_beside_a_second_order_solver_says_what_to_do(own: str
     config = _composed("model=zeronvs", "sampler.solver=dpmpp", own)
     with pytest.raises(InputError, match=r"sampler\.eta=0"):
         sampler_for(config.sampler, config.model)
-
-
-def test_what_a_model_recommends_can_be_left_out() -> None:
-    recommended = ["model.sampler.compat=megascenes"]
-    config = _composed("model=zeronvs", *recommended, "sampler.without=[compat]")
-    assert sampler_for(config.sampler, config.model) == _PUBLISHED
-    other = _composed("model=zeronvs", "sampler.without=[steps]")
-    with pytest.raises(InputError, match=r"sampler\.without=steps"):
-        check_options(other)
 
 
 def test_a_saved_model_remembers(folder: Path) -> None:
