@@ -36,12 +36,10 @@ from extrap_train.exits import ends_in_one_line
 from extrap_train.store import Outcome
 from extrap_train.terminal import terminal
 
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
-"""Errors of a full disk."""
-_CLOSED = (errno.EACCES, errno.EROFS)
-"""Errors of a path that may not be read or written."""
+_UNUSABLE = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.ENAMETOOLONG)
+"""Errors of a disk that is full, of a path that is closed, and of a name that is too long."""
 _NO_FOLDER = (errno.ENOTDIR, errno.ENOENT, errno.EEXIST)
-"""Errors below an output that can be no folder."""
+"""Errors on the way to an output that can be no folder."""
 
 TRAIN = CommandOptions(
     "python -m extrap_train", "train", TrainConfig, TASKS, ("experiment", "sweep")
@@ -97,11 +95,13 @@ def _compose(options: CommandOptions, run: Callable[[Any], Outcome | Path | None
                 terminal(stderr=True).print(f"note: {note}")
             return run(typed)
         except OSError as error:
-            remedy = _remedy(error, output)
-            if remedy is None:
+            place = Path(str(error.filename or output))
+            if error.errno not in _UNUSABLE and not _leads_to_no_folder(error, place, output):
                 raise
-            message = f"{error.filename or output}: {error.strerror}; {remedy}"
-            raise InputError(message) from error
+            raise InputError(
+                f"{place}: {error.strerror}; free space, change its rights, or choose another "
+                "output= or a shorter run=NAME"
+            ) from error
 
     @hydra.main(version_base="1.3", config_path="pkg://conf", config_name=options.config_name)
     def composed(config: DictConfig) -> Outcome | Path | None:
@@ -138,25 +138,10 @@ def _complete(options: CommandOptions, run: Callable[[Any], Outcome | Path | Non
             print(*shown)
 
 
-def _remedy(error: OSError, output: str) -> str | None:
-    """What a user can do about it; None where it says nothing of a disk or folder of theirs."""
-    if error.errno == errno.ENAMETOOLONG:
-        return "give a shorter run=NAME or output="
-    place = Path(str(error.filename or output))
-    is_of_output = _is_of_output(place.absolute(), Path(output).absolute())
-    if error.errno in _NO_ROOM or (is_of_output and error.errno in _CLOSED):
-        return "free space or choose another output="
-    if is_of_output and error.errno in _NO_FOLDER and not Path(output).is_dir():
-        return "choose another output="
-    if error.errno in _CLOSED:
-        return "change its rights, or name another place"
-    return None
-
-
-def _is_of_output(place: Path, output: Path) -> bool:
-    """Whether it lies below the output, or is a folder above that could not be made."""
-    is_missing_parent = output.is_relative_to(place) and not os.access(place, os.F_OK)
-    return place.is_relative_to(output) or is_missing_parent
+def _leads_to_no_folder(error: OSError, place: Path, output: str) -> bool:
+    place, folder = place.absolute(), Path(output).absolute()
+    is_on_the_way = place.is_relative_to(folder) or folder.is_relative_to(place)
+    return is_on_the_way and error.errno in _NO_FOLDER and not folder.is_dir()
 
 
 def typed_config(config: DictConfig) -> Any:

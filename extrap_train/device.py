@@ -10,6 +10,9 @@ import torch
 from extrap_train.config import LoraConfig, TrainerConfig
 from extrap_train.errors import InputError
 
+Advice = AbstractContextManager[None]
+"""Turns running out of memory within it into one line with what helps; other errors pass."""
+
 
 def fastest_device() -> torch.device:
     """The GPU where there is one, else the CPU."""
@@ -73,39 +76,33 @@ def is_out_of_memory(error: BaseException) -> bool:
     return isinstance(error, RuntimeError) and "can't allocate memory" in str(error)
 
 
-@contextmanager
-def advise_on_training_memory(options: TrainerConfig) -> Iterator[None]:
-    """Turn running out of memory in training into one line with what helps; other errors pass."""
+def advise_on_training_memory(options: TrainerConfig) -> Advice:
+    """For training a model."""
     remedies = [
         (not options.gradient_checkpointing, "trainer.gradient_checkpointing=true"),
         (options.batch_size > 1, f"trainer.batch_size={max(1, options.batch_size // 2)}"),
         (options.ema_decay > 0, "trainer.ema_decay=0 (no averaged weights)"),
     ]
-    with _out_of_memory_advice(f"at trainer.batch_size={options.batch_size}", remedies):
-        yield
+    return _out_of_memory_advice(f"at trainer.batch_size={options.batch_size}", remedies)
 
 
-@contextmanager
-def advise_on_adapting_memory(lora: LoraConfig, trainer: TrainerConfig) -> Iterator[None]:
-    """`advise_on_training_memory` for an adapter's training."""
+def advise_on_adapting_memory(lora: LoraConfig, trainer: TrainerConfig) -> Advice:
+    """For an adapter's training."""
     remedies = [
         (not trainer.gradient_checkpointing, "trainer.gradient_checkpointing=true"),
         (lora.batch_size > 1, f"lora.batch_size={max(1, lora.batch_size // 2)}"),
         (lora.convolutions, "lora.convolutions=false"),
     ]
-    with _out_of_memory_advice(f"at lora.batch_size={lora.batch_size}", remedies):
-        yield
+    return _out_of_memory_advice(f"at lora.batch_size={lora.batch_size}", remedies)
 
 
-@contextmanager
-def advise_on_sampling_memory(at_once: int, trainer: TrainerConfig) -> Iterator[None]:
-    """`advise_on_training_memory` for sampling so many views at once."""
+def advise_on_sampling_memory(at_once: int, trainer: TrainerConfig) -> Advice:
+    """For sampling so many views at once."""
     remedies = [
         (at_once > 1, f"sample_batch_size={max(1, at_once // 2)}"),
         (torch.cuda.is_available() and trainer.accelerator != "cpu", "trainer.accelerator=cpu"),
     ]
-    with _out_of_memory_advice(f"sampling {at_once} views at once", remedies):
-        yield
+    return _out_of_memory_advice(f"sampling {at_once} views at once", remedies)
 
 
 @contextmanager

@@ -26,9 +26,6 @@ from extrap_train.tasks.scene_inputs import frame_digest, required_scene
 from extrap_train.terminal import terminal
 from extrap_train.views import Camera, View
 
-_OF_TRAINING = ("name", "start", "learning_rate", "projection_rate", "weight_decay")
-"""Say nothing of what a trained model is."""
-
 
 @dataclass(frozen=True)
 class UsedWeights:
@@ -158,12 +155,11 @@ def open_model(
     adapter applied if any.
 
     A published checkpoint does not say what it is: it is read as the model that `config` describes.
-    InputError where that is another than the saved one.
     """
     path = _folder_of(weights)
     if is_own(path):
         if config is not None:
-            require_saved_model(saved_config(path), config, path)
+            raise InputError(f"weights={weights}: says itself what it is; leave config out")
         model = load_model(path)
     elif config is not None:
         model = published_model(weights, config)
@@ -217,20 +213,10 @@ def require_saved_options(saved: ModelConfig, asked: ModelConfig, folder: Path) 
     `model=NAME` the family must be the model's.
     """
     said = [name for name in _cli_overrides() if name != "model.name"]  # names its runs' folder
-    names = [n for n in _flat(asked) if any(f"{n}.".startswith(f"{option}.") for option in said)]
-    _require(saved, asked, names, folder)
-
-
-def require_saved_model(saved: ModelConfig, described: ModelConfig, folder: Path) -> None:
-    """InputError where a description that was given of a saved model is another's."""
-    left_out = [f"model.{name}" for name in _OF_TRAINING]
-    _require(saved, described, [name for name in _flat(described) if name not in left_out], folder)
-
-
-def _require(saved: ModelConfig, asked: ModelConfig, names: Iterable[str], folder: Path) -> None:
     found, wanted = _flat(saved), _flat(asked)
-    for name in names:
-        if wanted[name] != (is_so := found.get(name)):
+    for name in wanted:
+        is_said = any(f"{name}.".startswith(f"{option}.") for option in said)
+        if is_said and wanted[name] != (is_so := found.get(name)):
             remedy = "remove this option, or give weights= that were trained with it"
             if name.startswith("model.sampler."):
                 remedy = f"give {name.removeprefix('model.')}= instead"
