@@ -99,8 +99,8 @@ def _compose(options: CommandOptions, run: Callable[[Any], Outcome | Path | None
             if error.errno not in _UNUSABLE and not _leads_to_no_folder(error, place, output):
                 raise
             raise InputError(
-                f"{place}: {error.strerror}; free space, change its rights, or choose another "
-                "output= or a shorter run=NAME"
+                f"{place}: {error.strerror}; free space, change its rights, give a shorter "
+                "run=NAME or choose another output="
             ) from error
 
     @hydra.main(version_base="1.3", config_path="pkg://conf", config_name=options.config_name)
