@@ -23,6 +23,7 @@ from extrap_train.store.atomic import partial_path, replace_synced, write_atomic
 _HOLE_COLOUR = (1.0, 0.0, 1.0)
 _LEAST_TILE_PIXELS = 128
 _FONT_PIXELS = 10
+_FRAMES_PER_SECOND = 12
 _PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 _STEM_BYTES = 200
 """With what is put behind it, a name stays one that every file system takes."""
@@ -139,7 +140,7 @@ def picture_names(names: Sequence[str]) -> list[str]:
     return chosen
 
 
-def film(images: Float[Tensor, "n 3 h w"], path: Path, frames_per_second: int = 12) -> None:
+def film(images: Float[Tensor, "n 3 h w"], path: Path) -> None:
     """Write pictures as an animation, GIF or MP4 by the file's suffix, small ones enlarged.
 
     The MP4 holds VP9, which browsers and players read; a GIF repeats for ever.
@@ -151,9 +152,9 @@ def film(images: Float[Tensor, "n 3 h w"], path: Path, frames_per_second: int = 
         temporary.mkdir(parents=True, exist_ok=True)
         made = temporary / path.name
         if path.suffix == ".gif":
-            _write_gif(frames, made, frames_per_second)
+            _write_gif(frames, made)
         else:
-            _write_mp4(frames, made, frames_per_second)
+            _write_mp4(frames, made)
         replace_synced(made, path)
     except OSError as error:
         raise InputError(
@@ -171,16 +172,16 @@ def _enlarged(pixels: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(large[:, : large.shape[1] // 2 * 2, : large.shape[2] // 2 * 2])
 
 
-def _write_gif(frames: np.ndarray, path: Path, frames_per_second: int) -> None:
+def _write_gif(frames: np.ndarray, path: Path) -> None:
     first, *rest = [Image.fromarray(frame) for frame in frames]
-    pause_ms = round(1000 / frames_per_second)
+    pause_ms = round(1000 / _FRAMES_PER_SECOND)
     first.save(path, save_all=True, append_images=rest, duration=pause_ms, loop=0)
 
 
-def _write_mp4(frames: np.ndarray, path: Path, frames_per_second: int) -> None:
+def _write_mp4(frames: np.ndarray, path: Path) -> None:
     height, width = frames.shape[1:3]
     codec = cv2.VideoWriter.fourcc(*"vp09")
-    writer = cv2.VideoWriter(str(path), codec, frames_per_second, (width, height))
+    writer = cv2.VideoWriter(str(path), codec, _FRAMES_PER_SECOND, (width, height))
     if not writer.isOpened():
         raise InputError(f"{path}: this OpenCV cannot write VP9 video; write a .gif instead")
     for frame in frames:

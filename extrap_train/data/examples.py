@@ -46,7 +46,7 @@ class Example:
 
 def mirror(example: Example) -> Example:
     """The example in a mirror: left and right exchanged in images, cameras and world alike."""
-    flows = example.reference_flows
+    flows, flip = example.reference_flows, torch.tensor([-1.0, 1.0])[:, None, None]
     return replace(
         example,
         image=example.image.flip(-1),
@@ -54,12 +54,8 @@ def mirror(example: Example) -> Example:
         reference_images=example.reference_images.flip(-1),
         reference_cameras=_mirror_camera(example.reference_cameras),
         reference_depths=example.reference_depths.flip(-1),
-        reference_flows=None if flows is None else _mirror_flows(flows),
+        reference_flows=None if flows is None else flows.flip(-1) * flip,
     )
-
-
-def _mirror_flows(flows: Float[Tensor, "k 2 g g"]) -> Float[Tensor, "k 2 g g"]:
-    return flows.flip(-1) * flows.new_tensor([-1.0, 1.0])[:, None, None]
 
 
 def _mirror_camera(camera: Camera) -> Camera:
@@ -201,30 +197,20 @@ class ExampleReader:
     def read(self, index: int, count: int, rng: np.random.Generator) -> Example:
         """The pair's example with up to `count` references; those after the first are drawn."""
         data, pair = self._pairs[index]
-        references = self._references(data, pair, count, rng)
-        return read_example(data, replace(pair, references=references), self._is_corrected(data))
+        is_corrected = self._split == "train" and data.is_corrected
+        # The query may be seen from frames whose correction is known, where there is one.
+        candidates = (
+            data.partners(pair.sequence, pair.query)
+            if is_corrected
+            else data.reference_frames(pair.sequence)
+        )
+        first, angles = pair.references[0], self._angles_of(data, pair.sequence)
+        further = extra_references(angles, pair.query, first, count, rng, candidates)
+        return read_example(data, replace(pair, references=(first, *further)), is_corrected)
 
     def pack(self, examples: list[Example]) -> PackedBatch:
         """A batch with room for the reader's number of references."""
         return pack(examples, self.references)
-
-    def _references(
-        self, data: PreparedData, pair: ViewPair, count: int, rng: np.random.Generator
-    ) -> tuple[int, ...]:
-        """Frames that the pair's query is seen from, nearest first; the pair's own is the first."""
-        first = pair.references[0]
-        angles = self._angles_of(data, pair.sequence)
-        candidates = self._candidates(data, pair.sequence, pair.query)
-        return (first, *extra_references(angles, pair.query, first, count, rng, candidates))
-
-    def _candidates(self, data: PreparedData, sequence: str, query: int) -> np.ndarray:
-        """Frames that it may be seen from: those whose correction is known, where there is one."""
-        if self._is_corrected(data):
-            return data.partners(sequence, query)
-        return data.reference_frames(sequence)
-
-    def _is_corrected(self, data: PreparedData) -> bool:
-        return self._split == "train" and data.is_corrected
 
     def _angles_of(self, data: PreparedData, sequence: str) -> np.ndarray:
         key = (data.folder, sequence)  # no `id`: it means nothing in a worker process

@@ -128,7 +128,7 @@ def sequence_of_photographs(
     listed: Sequence[Listed],
     description: Path,
     convention: PoseConvention,
-    unusable: Sequence[str] = (),
+    unusable: Sequence[str],
     point_cloud: PointCloud | None = None,
 ) -> FrameSequence:
     """A sequence of the photographs below `files.root`, in the order of their paths.

@@ -135,7 +135,8 @@ class PreparedData:
         self._reference = frames["reference"].to_numpy()
         self._names = frames["name"]
         self._rows = _row_ranges(frames["sequence"].to_numpy())
-        self.roles: dict[str, str] = _roles(sequences)
+        kept = sequences[sequences["kept"]]
+        self.roles: dict[str, str] = dict(zip(kept["sequence"], kept["split"], strict=True))
         """`train`, `test` or `train and test` of every sequence that is kept."""
         self._frames_root = folder / manifest["frames"]
         self._pairs_root = folder / manifest["pair_files"]
@@ -275,11 +276,6 @@ def _read_table(folder: Path, name: str, manifest: dict[str, Any]) -> pa.Table:
     except (OSError, pa.ArrowException) as error:
         reason = str(error).splitlines()[0]
         raise damaged_error(folder, f"{file}: {reason}") from None
-
-
-def _roles(sequences: pd.DataFrame) -> dict[str, str]:
-    kept = sequences[sequences["kept"]]
-    return dict(zip(kept["sequence"], kept["split"], strict=True))
 
 
 def _values(column: pd.Series) -> np.ndarray:

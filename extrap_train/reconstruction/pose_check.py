@@ -1,6 +1,7 @@
 """Poses in another axis convention, found by what the photographs' matches say of them."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -42,8 +43,9 @@ def check_poses(views: Sequence[View]) -> None:
             continue
         points = features.pixels[pairs[:, 0]], other_features.pixels[pairs[:, 1]]
         given.append(_distance(*points, one, other))
-        for name, cameras in _alternatives(one, other).items():
-            others.setdefault(name, []).append(_distance(*points, *cameras))
+        others_of = _read_otherwise(other)
+        for name, camera in _read_otherwise(one).items():
+            others.setdefault(name, []).append(_distance(*points, camera, others_of[name]))
     if not given or np.median(given) < FAR_PIXELS:
         return
     best = min(others, key=lambda name: float(np.median(others[name])))
@@ -63,20 +65,14 @@ def small_view(view: View, side: int = SIDE) -> View:
     return view.resized(round(view.camera.height * scale), round(view.camera.width * scale))
 
 
-def _alternatives(one: Camera, other: Camera) -> dict[str, tuple[Camera, Camera]]:
-    """Both cameras, had their matrices been meant otherwise."""
-    found = {name: (_flipped(one, signs), _flipped(other, signs)) for name, signs in _FLIPS.items()}
-    found["camera-to-world matrices"] = (_inverted(one), _inverted(other))
-    return found
-
-
-def _flipped(camera: Camera, signs: tuple[float, float, float]) -> Camera:
-    flip = torch.diag(torch.tensor([*signs, 1.0]))
-    return Camera(flip @ camera.world_to_cam, camera.intrinsics, camera.height, camera.width)
-
-
-def _inverted(camera: Camera) -> Camera:
-    return Camera(camera.cam_to_world, camera.intrinsics, camera.height, camera.width)
+def _read_otherwise(camera: Camera) -> dict[str, Camera]:
+    """The camera, had its matrix been meant otherwise."""
+    flipped = {
+        name: torch.diag(torch.tensor([*signs, 1.0])) @ camera.world_to_cam
+        for name, signs in _FLIPS.items()
+    }
+    matrices = flipped | {"camera-to-world matrices": camera.cam_to_world}
+    return {name: replace(camera, world_to_cam=found) for name, found in matrices.items()}
 
 
 def _distance(

@@ -75,7 +75,6 @@ def write_annotations(
     frame_entries: Iterable[Mapping[str, Any]],
     sequence_entries: Iterable[Mapping[str, Any]],
     splits: Mapping[str, Sequence[str]],
-    set_list: str = "manyview_dev_0",
 ) -> None:
     """Write a category's annotations and set list; `splits` gives the sequences of `train`, `test`.
 
@@ -94,7 +93,9 @@ def write_annotations(
         for subset in ("train", "val", "test")
     }
     folder = root / category
-    write_atomic(folder / "set_lists" / f"set_lists_{set_list}.json", json.dumps(subsets).encode())
+    write_atomic(
+        folder / "set_lists" / "set_lists_manyview_dev_0.json", json.dumps(subsets).encode()
+    )
     write_atomic(folder / SEQUENCE_ANNOTATIONS, _jgz(sequences))
     write_atomic(folder / FRAME_ANNOTATIONS, _jgz(frames))
 

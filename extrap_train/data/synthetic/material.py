@@ -12,6 +12,10 @@ from extrap_train.data.synthetic.vectors import Real
 Color = Float[np.ndarray, " 3"]
 Numbers = Float[np.ndarray, " n"]
 """One a point."""
+_RINGS = 9.0
+"""Of wood, per unit length."""
+_BAND = 0.4
+"""Share of a plaid's period that a band takes."""
 
 
 @dataclass(frozen=True)
@@ -123,26 +127,21 @@ class Mottled:
 
 @dataclass(frozen=True)
 class Wood:
-    """Growth rings of a trunk along `axis`, wavered by noise."""
+    """Growth rings of a trunk along +Z, wavered by noise."""
 
     low: Color
     high: Color
     seed: int
-    axis: int = 2
-    rings: Real = 9.0
-    """Per unit length."""
 
     def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
         """Reflectance in linear light."""
-        stretch = np.ones(3, np.float32)
-        stretch[self.axis] = 0.15
+        stretch = np.array([1, 1, 0.15], np.float32)
         points = surface.points * stretch + np.array([0.37, 0.21, 0.13], np.float32)
-        across = [i for i in range(3) if i != self.axis]
-        radius = np.hypot(points[:, across[0]], points[:, across[1]])
-        waver = fractal_noise(points, surface.footprint, self.rings / 3, 2, self.seed)
-        fine = fractal_noise(points, surface.footprint, self.rings * 3, 2, self.seed + 7)
-        phase = radius * self.rings + waver * 1.5
-        kept = np.clip(1.2 - surface.footprint * self.rings * 2, 0, 1)
+        radius = np.hypot(points[:, 0], points[:, 1])
+        waver = fractal_noise(points, surface.footprint, _RINGS / 3, 2, self.seed)
+        fine = fractal_noise(points, surface.footprint, _RINGS * 3, 2, self.seed + 7)
+        phase = radius * _RINGS + waver * 1.5
+        kept = np.clip(1.2 - surface.footprint * _RINGS * 2, 0, 1)
         rings = 0.5 + 0.5 * np.sin(2 * np.pi * phase) * kept
         return mix(self.low, self.high, 0.75 * rings + 0.5 * fine)
 
@@ -196,17 +195,15 @@ class Plaid:
     warp: Color
     weft: Color
     period: Real
-    width: Real = 0.4
-    """Share of the period that a band takes."""
 
     def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
         """Reflectance in linear light."""
         x, y = surface.planar().T
         kept = np.clip(1.5 - 2 * surface.footprint / self.period, 0, 1)
-        half = self.width * self.period / 2
+        half = _BAND * self.period / 2
         bands = [
             step(half - _edge_distance(t, self.period), surface.footprint) * kept
-            + self.width * (1 - kept)
+            + _BAND * (1 - kept)
             for t in (x, y)
         ]
         return mix(mix(self.base, self.warp, 0.6 * bands[0]), self.weft, 0.6 * bands[1])

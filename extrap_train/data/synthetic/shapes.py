@@ -161,9 +161,9 @@ def sheet(points: Rows) -> Mesh:
     return _grid_mesh(np.asarray(points, float), np.arange(len(points) - 1), closed=False)
 
 
-def flat_ground(half: tuple[Real, Real], lines: int = 44) -> Mesh:
+def flat_ground(half: tuple[Real, Real]) -> Mesh:
     """A rectangle in the plane z = 0, finely divided near its centre to carry soft shading."""
-    spread = np.sinh(np.linspace(-3.2, 3.2, lines)) / np.sinh(3.2)
+    spread = np.sinh(np.linspace(-3.2, 3.2, 44)) / np.sinh(3.2)
     x, y = np.meshgrid(spread * half[0], spread * half[1], indexing="xy")
     return sheet(np.stack([x, y, np.zeros_like(x)], -1))
 
