@@ -2,7 +2,8 @@
 
 One vertex a Gaussian, little-endian floats: `x y z`, `nx ny nz` (zeros), `f_dc_*` (degree 0),
 `f_rest_*` (the other coefficients, all of red, then green, then blue), `opacity` (its logit),
-`scale_*` (logarithms), `rot_*` (unit quaternion w, x, y, z).
+`scale_*` (logarithms), `rot_*` (unit quaternion w, x, y, z). The third line of the header is the
+number of vertices, whatever it says besides: there the authors' own viewer looks for it.
 """
 
 import io
@@ -39,8 +40,8 @@ def write_splats(path: Path, gaussians: Gaussians, comments: Sequence[str] = ())
     dtype = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz", *_rest(rest.shape[1]))]
     vertices = np.ascontiguousarray(table).view(dtype)[:, 0]
     content = io.BytesIO()
-    elements = [PlyElement.describe(vertices, "vertex")]
-    PlyData(elements, byte_order="<", comments=list(comments)).write(content)
+    element = PlyElement.describe(vertices, "vertex", comments=list(comments))
+    PlyData([element], byte_order="<").write(content)
     write_atomic(path, content.getvalue())
 
 
@@ -73,7 +74,8 @@ def read_splats(path: Path) -> Gaussians:
 
 def read_comments(path: Path) -> tuple[str, ...]:
     """The lines that a PLY file's header says to people."""
-    return tuple(_read(path).comments)
+    content = _read(path)
+    return (*content.comments, *content["vertex"].comments)
 
 
 def _rest(count: int) -> list[str]:

@@ -7,7 +7,7 @@ from plyfile import PlyData, PlyElement
 from splats import random_gaussians
 
 from extrap_train.errors import InputError
-from extrap_train.gaussians.ply import read_splats, write_splats
+from extrap_train.gaussians.ply import read_comments, read_splats, write_splats
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -39,6 +39,28 @@ def test_layout_is_that_of_the_viewers(tmp_path):
     assert vertex["f_rest_4"] == gaussians.sh[1, 2, 1]  # green's second of three
     assert 1 / (1 + np.exp(-vertex["opacity"])) == pytest.approx(gaussians.opacities[1].item())
     assert np.exp(vertex["scale_2"]) == pytest.approx(gaussians.scales[1, 2].item())
+
+
+def test_the_viewer_of_the_3dgs_authors_reads_it_beside_comments(tmp_path):
+    """By the rules of its loader: three lines, whatever up to `end_header`, and rows of one struct,
+    whose colours are channel by channel behind the constant ones."""
+    gaussians = random_gaussians(5, degree=3)
+    write_splats(tmp_path / "s.ply", gaussians, comments=["fitted to 9 views"])
+    with (tmp_path / "s.ply").open("rb") as file:
+        assert file.readline() == b"ply\n"
+        assert file.readline() == b"format binary_little_endian 1.0\n"
+        assert file.readline().split() == [b"element", b"vertex", b"5"]
+        while file.readline() != b"end_header\n":
+            pass
+        rows = np.frombuffer(file.read(), "<f4").reshape(5, 3 + 3 + 48 + 1 + 3 + 4)
+    position, _, colors, opacity, scale, rotation = np.split(rows, [3, 6, 54, 55, 58], 1)
+    assert np.array_equal(position, gaussians.means)
+    assert np.array_equal(colors[:, :3], gaussians.sh[:, 0])
+    assert np.array_equal(colors[:, 3:].reshape(5, 3, 15).swapaxes(1, 2), gaussians.sh[:, 1:])
+    assert np.allclose(1 / (1 + np.exp(-opacity[:, 0])), gaussians.opacities, atol=1e-6)
+    assert np.allclose(np.exp(scale), gaussians.scales, rtol=1e-5)
+    assert np.allclose(np.linalg.norm(rotation, axis=1), 1, atol=1e-6)
+    assert "fitted to 9 views" in read_comments(tmp_path / "s.ply")
 
 
 def test_opaque_and_flat_ones_stay_finite(tmp_path):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scenes
 import torch
+import trimesh
 from PIL import Image
 from plyfile import PlyData
 
@@ -117,6 +118,14 @@ def test_nerfstudio_finds_pictures_and_depths_on_the_surface(folder: Path) -> No
     assert len(points) > 100
     assert np.abs(distance / _UNIT.unit - _RADIUS).max() < 0.01
     assert cloud["red"].dtype == np.uint8
+
+
+def test_trimesh_reads_the_cloud_with_its_colours(folder: Path, known: GlobalMap) -> None:
+    read = trimesh.load(folder / "cloud.ply")
+    assert isinstance(read, trimesh.PointCloud)
+    cloud = cloud_of(known)
+    assert np.allclose(read.vertices, _UNIT.points_outside(cloud.points), atol=1e-5)
+    assert np.abs(np.array(read.colors)[:, :3] / 255 - cloud.colors.numpy()).max() <= 0.51 / 255
 
 
 def test_our_own_reader_agrees(folder: Path) -> None:
