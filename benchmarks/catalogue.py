@@ -16,11 +16,9 @@ from extrap_train.command_options import CommandOptions, choices_of, open_own_fo
 from extrap_train.config import (
     LPIPS_NETS,
     METRICS,
-    CapturesConfig,
     DepthConfig,
     MethodConfig,
     MetricConfig,
-    SyntheticConfig,
     TableConfig,
     check_options,
 )
@@ -142,7 +140,6 @@ def _check_table(table: TableConfig) -> None:
     """What one option cannot say alone."""
     rules = table.rules
     _require_known("draws", table.draws, rules.draws)
-    _require_held_out(table.captures)
     given = table.captures.source == "reconfusion"  # its files name inputs and targets
     if rules.draws != ["given"] if given else "given" in rules.draws:
         raise InputError(
@@ -154,26 +151,6 @@ def _check_table(table: TableConfig) -> None:
             f"rules.views={rules.views}: no target is left of rules.pool={rules.pool} frames; give "
             "smaller numbers of views"
         )
-
-
-def _require_held_out(captures: CapturesConfig) -> None:
-    """InputError for rendered captures that models are trained on: all but the first few."""
-    usual = SyntheticConfig()
-    is_usual = captures.source == "synthetic" and captures.seed == usual.seed
-    if is_usual and captures.sequences > usual.test_sequences:
-        raise InputError(
-            f"captures.sequences={captures.sequences}: models are trained on the rendered captures "
-            f"after the first {usual.test_sequences}; give fewer, or another captures.seed="
-        )
-    for spec in captures.scenes if captures.source == "scenes" else ():
-        scheme, _, name = spec.partition(":")
-        number = name.rpartition("/")[2]
-        is_number = scheme == "synthetic" and number.isascii() and number.isdigit()
-        if is_number and int(number) >= usual.test_sequences:
-            raise InputError(
-                f"captures.scenes: models are trained on {spec}; give one of the first "
-                f"{usual.test_sequences}"
-            )
 
 
 def lpips_weights_of(overrides: Iterable[str]) -> dict[str, str]:

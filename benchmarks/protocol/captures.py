@@ -26,7 +26,7 @@ from extrap_train.data.sequences import NO_CATEGORY, FrameSequence
 from extrap_train.data.synthetic import build_scene, surface_points
 from extrap_train.data.synthetic.capture import synthetic_sequence
 from extrap_train.data.transforms_json import TRANSFORMS, read_transforms
-from extrap_train.diffusion.model_files import ancestors
+from extrap_train.diffusion.leakage import Training, trainings_of
 from extrap_train.errors import InputError
 from extrap_train.store.manifest import Split
 from extrap_train.views import stack_poses
@@ -43,68 +43,40 @@ class Capture:
     surface: Callable[[], TrueSurface] | None = None
 
 
-@dataclass(frozen=True)
-class TrainedModel:
-    """A method's model whose run records what it was trained on."""
-
-    method: str
-    model: str
-    """Its folder, or the name of a packaged one."""
-    category: str
-    split: Split
-    is_start: bool
-    """Whether the method's weights only started from this model."""
-
-    def require_unseen(self, category: str, capture: Split) -> None:
-        """InputError for a capture, as the split that holds it out, that the model has seen.
-
-        CO3D's names are unique, whatever category a table gives them; those of rendered captures
-        count within their category.
-        """
-        is_own = category == self.category or capture.source != "synthetic"
-        if is_own and (leaked := capture.leaked_from(self.split)):
-            raise InputError(
-                f"options.{self.method}.weights: {self.model} was trained on the capture "
-                f"{leaked[0]}; test on others, or give weights that have not seen it"
-            )
+Trained = Sequence[tuple[str, Training, bool]]
+"""Methods by name with what their weights, or those that they started from, were trained on; and
+whether it is the weights themselves.
+"""
 
 
-def trained_models(
-    methods: Iterable[MethodConfig], categories: Collection[str]
-) -> list[TrainedModel]:
-    """The models that the methods' `weights` name, and those that they started from, as far as it
-    is known what they were trained on.
+def trained_models(methods: Iterable[MethodConfig], categories: Collection[str]) -> Trained:
+    """What the methods' models were trained on, as far as that is known.
 
-    Where no weights are named, the packaged ones are used: the catalogue checks their captures.
+    A method that names no `weights` may use any packaged model; those have one training.
     """
     found = []
     for method in methods:
-        weights = method.options.get("weights")
-        if not isinstance(weights, str):
-            continue
-        for folder in sorted({weights.replace("{category}", c) for c in categories or [""]}):
-            for model, manifest in ancestors(folder):
-                found += [
-                    TrainedModel(method.name, model, category, split, is_start=model != folder)
-                    for category, split in manifest.split.items()
-                ]
+        weights = method.options.get("weights") or "base"
+        for folder in sorted({str(weights).replace("{category}", c) for c in categories or [""]}):
+            seen = trainings_of(folder)
+            found += [(method.name, training, training.model == folder) for training in seen]
     return found
 
 
 def _held_out_by_all(
-    models: Iterable[TrainedModel], category: str, present: Collection[str], count: int
+    trained: Trained, category: str, present: Collection[str], count: int
 ) -> list[str] | None:
     """Up to `count` test captures that every model of a category holds out, in the order of a
     split; None where there is no model of it. Raises InputError where there are none.
     """
-    models = [m for m in models if m.category == category and m.split.source == "co3d"]
-    tested = [model.split.test for model in models if not model.is_start]
+    trained = [t for t in trained if (t[1].category, t[1].split.source) == (category, "co3d")]
+    tested = [training.split.test for _, training, is_used in trained if is_used]
     if not tested:
         return None
-    seen = {name for model in models for name in model.split.train}
-    common = set(present).intersection(*tested) - seen
+    seen = [training.split.train for _, training, _ in trained]
+    common = set(present).intersection(*tested).difference(*seen)
     if not common:
-        runs = " and ".join(sorted({model.model for model in models}))
+        runs = " and ".join(sorted({training.model for _, training, _ in trained}))
         raise InputError(
             f"{category}: none of the {len(present)} captures is held out by {runs}; test on "
             "other captures, or train with more data.test_sequences"
@@ -113,17 +85,23 @@ def _held_out_by_all(
 
 
 def open_captures(
-    config: CapturesConfig, categories: list[str], models: Sequence[TrainedModel] = ()
+    config: CapturesConfig, categories: list[str], trained: Trained = ()
 ) -> list[Capture]:
     """The test captures of some categories; nothing is rendered or decoded yet.
 
-    Raises InputError for a capture that one of the `models` was trained on.
+    Raises InputError for a capture that a model was `trained` on.
     """
-    captures = _open(config, categories, models)
+    captures = _open(config, categories, trained)
     for index, capture in enumerate(captures):
-        tested = _held_out(config, index, capture.sequence.name)
-        for model in models:
-            model.require_unseen(capture.sequence.category, tested)
+        sequence = capture.sequence
+        held_out = _held_out(config, index, sequence.name)
+        for method, training, _ in trained:
+            if training.find_leaks(sequence.category, held_out):
+                raise InputError(
+                    f"options.{method}.weights: {training.model} was trained on the capture "
+                    f"{sequence.category}/{sequence.name}; give captures that it has not seen "
+                    "(captures.sequences, captures.seed, captures.scenes) or other weights"
+                )
     return captures
 
 
@@ -136,9 +114,7 @@ def _held_out(config: CapturesConfig, index: int, name: str) -> Split:
     return Split("co3d", (), (name,))
 
 
-def _open(
-    config: CapturesConfig, categories: list[str], models: Sequence[TrainedModel]
-) -> list[Capture]:
+def _open(config: CapturesConfig, categories: list[str], trained: Trained) -> list[Capture]:
     match config.source:
         case "synthetic":
             return [
@@ -148,7 +124,7 @@ def _open(
             ]
         case "co3d":
             return [
-                _with_cloud(s) for category in categories for s in _co3d(config, category, models)
+                _with_cloud(s) for category in categories for s in _co3d(config, category, trained)
             ]
         case "reconfusion":
             return [_with_cloud(s) for s in _reconfusion(config)]
@@ -195,9 +171,7 @@ def _with_cloud(sequence: FrameSequence) -> Capture:
     return Capture(sequence, lambda: TrueSurface(read_points(cloud), torch.zeros(0, 3)))
 
 
-def _co3d(
-    config: CapturesConfig, category: str, models: Sequence[TrainedModel]
-) -> list[FrameSequence]:
+def _co3d(config: CapturesConfig, category: str, trained: Trained) -> list[FrameSequence]:
     """The captures that the models' runs have held out; where no run says so, those that training
     on the same download with its usual options does.
     """
@@ -205,7 +179,7 @@ def _co3d(
         raise InputError("captures.source=co3d needs the download: give captures.root=FOLDER")
     sequences = {f"{s.category}/{s.name}": s for s in read_category(Path(config.root), category)}
     present = [sequence.name for sequence in sequences.values()]
-    named = _held_out_by_all(models, category, present, config.sequences)
+    named = _held_out_by_all(trained, category, present, config.sequences)
     if named is not None:
         return [sequences[f"{category}/{name}"] for name in named]
     verdicts = judge_all(list(sequences.values()), PrepConfig())

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from extrap_train.config import MODEL_CONFIG, ModelConfig, dotted, packaged_names, validate_model
 from extrap_train.diffusion.encoders import PixelPatches
-from extrap_train.diffusion.hub import is_repository, weights_folder
+from extrap_train.diffusion.hub import weights_folder
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.packaged import compress, packaged_weights, restore
 from extrap_train.diffusion.published.config_compat import SCHEDULER, require_same_config
@@ -20,7 +20,6 @@ from extrap_train.diffusion.published.read import SOURCES, Shapes, read_publishe
 from extrap_train.diffusion.transfer import narrowed, turned_pose, widened
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import atomic_folder
-from extrap_train.store.manifest import MANIFEST, Manifest, read_manifest
 from extrap_train.store.records import read_record, write_record
 from extrap_train.weight_files import WeightFile, write_tensors
 
@@ -133,26 +132,6 @@ def saved_config(folder: Path) -> ModelConfig:
     except InputError as error:
         raise InputError(f"{file}: no model of this project ({error}); {_REMEDY}") from None
     return config
-
-
-def ancestors(start: str | None) -> Iterator[tuple[str, Manifest]]:
-    """Each model that the start goes back to with its manifest, as far as they have one.
-
-    It lies beside the model's folder, or within that of a repository. Published weights have none;
-    they were trained on other data sets.
-    """
-    known: set[str] = set()
-    while start is not None and start not in known:
-        known.add(start)
-        is_named = start in packaged_names() or is_repository(start)
-        folder = weights_folder(start, "model.start") if is_named else Path(start)
-        if not is_own(folder):
-            return
-        for place in (folder.resolve(), folder.resolve().parent):
-            if (place / MANIFEST).is_file():
-                yield start, read_manifest(place, "restore it from its run")
-                break
-        start = saved_config(folder).start
 
 
 def load_weights(

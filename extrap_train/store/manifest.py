@@ -35,13 +35,6 @@ class Split:
     seed: int | None = None
     """Of rendered captures: the same name under another seed is another object."""
 
-    def leaked_from(self, seen: "Split") -> list[str]:
-        """The captures held out here that were trained on there, within one category."""
-        differ = None not in (self.seed, seen.seed) and self.seed != seen.seed
-        if differ or self.source != seen.source:
-            return []
-        return sorted({*self.test} & {*seen.train})
-
 
 @dataclass(frozen=True)
 class Manifest:
@@ -87,14 +80,6 @@ class Manifest:
         ]
         more = len(found) - _MOST_NAMED
         return found if more <= 1 else [*found[:_MOST_NAMED], f"and {more} more"]
-
-    def leaked_from(self, seen: "Manifest") -> dict[str, list[str]]:
-        """The captures held out here that `seen` was trained on, by category."""
-        found = {
-            category: self.split[category].leaked_from(seen.split[category])
-            for category in self.split.keys() & seen.split.keys()
-        }
-        return {category: names for category, names in sorted(found.items()) if names}
 
 
 def _split_change(before: Split | None, now: Split | None) -> str:

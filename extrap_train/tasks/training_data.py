@@ -6,7 +6,7 @@ from extrap_train.config import TrainConfig
 from extrap_train.data.examples import ExampleReader
 from extrap_train.data.module import PairModule
 from extrap_train.data.prepared import PreparedData
-from extrap_train.diffusion.model_files import ancestors
+from extrap_train.diffusion.leakage import trainings_of
 from extrap_train.errors import InputError
 from extrap_train.store.manifest import Manifest
 
@@ -30,12 +30,12 @@ def data_module(config: TrainConfig, prepared: list[PreparedData]) -> PairModule
 
 def require_unseen(start: str | None, manifest: Manifest) -> None:
     """Raise InputError if a held-out capture is one that the start (`model.start`) has seen."""
-    for model, seen in ancestors(start):
-        for category, names in manifest.leaked_from(seen).items():
-            through = "" if model == start else f", by way of {model}"
-            first = seen.split[category].train[0]
-            is_rendered = manifest.split[category].source == "synthetic"
-            remedy = _other_seed(first) if is_rendered else _OTHERS
+    for seen in trainings_of(start):
+        for category, split in manifest.split.items():
+            if not (names := seen.find_leaks(category, split)):
+                continue
+            through = "" if seen.model == start else f", by way of {seen.model}"
+            remedy = _other_seed(seen.split.train[0]) if split.source == "synthetic" else _OTHERS
             raise InputError(
                 f"model.start={start} was trained on {_listed(names)} of {category}{through}, "
                 f"which are to be held out: {remedy}, or model.start=null"

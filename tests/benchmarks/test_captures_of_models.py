@@ -1,10 +1,11 @@
 """A model is tested on what its own run has held out, never on what it was trained on."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from benchmarks.protocol.captures import TrainedModel, open_captures, trained_models
+from benchmarks.protocol.captures import Trained, open_captures, trained_models
 from data_prep.split import split_sequences
 from extrap_train.config import (
     MODEL_CONFIG,
@@ -36,19 +37,19 @@ def _write_run(folder: Path, split: Split, start: str | None = None) -> str:
     return str(model)
 
 
-def _models_of(weights: str) -> list[TrainedModel]:
+def _models_of(weights: str | None) -> Trained:
     method = MethodConfig("mine", factory="a.B", options={"weights": weights})
     return trained_models([method, MethodConfig("other", factory="a.C")], ["cup"])
 
 
-def _models(folder: Path, test: tuple[str, ...]) -> list[TrainedModel]:
+def _models(folder: Path, test: tuple[str, ...]) -> Trained:
     """Of a method with the weights of a run that has held out these captures."""
     train = tuple(name for name in _NAMES if name not in test)
     _write_run(folder, Split("co3d", train, test))
     return _models_of(str(folder / "{category}-run" / "model"))
 
 
-def _captures(root: Path, models: list[TrainedModel], count: int = 2) -> list[str]:
+def _captures(root: Path, models: Trained, count: int = 2) -> list[str]:
     config = CapturesConfig(source="co3d", root=str(root), sequences=count)
     return [capture.sequence.name for capture in open_captures(config, ["cup"], models)]
 
@@ -78,7 +79,7 @@ def test_a_named_capture_that_was_trained_on_is_refused(root: Path, tmp_path: Pa
     assert len(open_captures(config, ["cup"], models)) == 1
     config.scenes.append(f"co3d:{root}/cup/b")
     with pytest.raises(
-        InputError, match=r"options\.mine\.weights.*cup-run/model was trained on .* b;"
+        InputError, match=r"options\.mine\.weights.*cup-run/model was trained on .* cup/b;"
     ):
         open_captures(config, ["cup"], models)
 
@@ -91,7 +92,7 @@ def test_a_capture_that_the_weights_started_from_has_seen_is_refused(
     models = _models_of(tuned)
     assert set(_captures(root, models, count=6)) == {"b", "f"}
     config = CapturesConfig(source="scenes", scenes=[f"co3d:{root}/cup/c"])
-    with pytest.raises(InputError, match=r"start/cup-run/model was trained on the capture c;"):
+    with pytest.raises(InputError, match=r"start/cup-run/model was trained on the capture cup/c;"):
         open_captures(config, ["cup"], models)
 
 
@@ -106,7 +107,7 @@ def test_rendered_captures_that_a_run_was_trained_on_are_refused(tmp_path: Path)
     open_rendered(["cup"])
     open_rendered(["cup"], sequences=2, seed=8)
     open_rendered(["book"], sequences=2)
-    with pytest.raises(InputError, match=r"cup-run/model was trained on the capture 0001;"):
+    with pytest.raises(InputError, match=r"cup-run/model was trained on the capture cup/0001;"):
         open_rendered(["cup"], sequences=2)
 
 
@@ -116,11 +117,19 @@ def test_rendered_scenes_that_a_run_was_trained_on_are_refused(root: Path, tmp_p
     config = CapturesConfig(source="scenes", scenes=["synthetic:cup/0002", f"co3d:{root}/cup/a"])
     assert len(open_captures(config, ["cup"], models)) == 2
     config.scenes.append("synthetic:cup/0001")
-    with pytest.raises(InputError, match=r"cup-run/model was trained on the capture 0001;"):
+    with pytest.raises(InputError, match=r"cup-run/model was trained on the capture cup/0001;"):
         open_captures(config, ["cup"], models)
 
 
-def test_a_packaged_model_says_what_it_was_trained_on() -> None:
-    config = CapturesConfig(source="synthetic", sequences=SyntheticConfig().test_sequences + 1)
-    with pytest.raises(InputError, match=r"options\.mine\.weights: base was trained on"):
-        open_captures(config, ["cup"], _models_of("base"))
+@pytest.mark.parametrize("weights", ["base", None])
+def test_packaged_models_say_what_they_were_trained_on(weights: str | None) -> None:
+    """A method that names no weights may use any of them."""
+    first_seen = SyntheticConfig().test_sequences
+    config = CapturesConfig(source="synthetic", sequences=first_seen)
+    assert len(open_captures(config, ["cup"], _models_of(weights))) == first_seen
+    with pytest.raises(InputError, match=rf"base was trained on .* cup/000{first_seen};"):
+        open_captures(replace(config, sequences=first_seen + 1), ["cup"], _models_of(weights))
+    open_captures(replace(config, sequences=first_seen + 1, seed=1), ["cup"], _models_of(weights))
+    named = CapturesConfig(source="scenes", scenes=["synthetic:cup/0010"])
+    with pytest.raises(InputError, match=r"captures\.scenes"):
+        open_captures(named, ["cup"], _models_of(weights))

@@ -43,7 +43,6 @@ def test_read_only_output_is_one_line(own: Path, tmp_path: Path) -> None:
         (["run", "table1", "columns=[psnrr]"], "columns"),
         (["run", "table1", "device=gpu"], "device"),
         (["run", "table1", "options.our.steps=3"], "ours"),
-        (["run", "table1", "captures.sequences=6"], "captures.sequences"),
         (["run", "table1", "methods=[ours,ours]"], "methods: ours"),
         (["run", "table1", "rules.views=[3,3]"], "rules.views: 3"),
         (["run", "table1", "rules.seeds=[0,0]"], "rules.seeds: 0"),
@@ -59,10 +58,6 @@ def test_read_only_output_is_one_line(own: Path, tmp_path: Path) -> None:
         (["run", "table1", "rules.pool=null"], "rules.pool=null"),
         (["run", "table1", "title"], "title: "),
         (["report", "table1", "columns=[psnr]"], "columns=[psnr]"),
-        (
-            ["run", "real", "captures.source=scenes", "captures.scenes=[synthetic:cup/0010]"],
-            "synthetic:cup/0010",
-        ),
         (["run", "table1", "--config-dir", "/nowhere"], "/nowhere"),
         (["report", "table1", "output=/nowhere"], "/nowhere"),
         (["verify", "/nowhere"], "/nowhere"),

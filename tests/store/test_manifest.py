@@ -57,21 +57,3 @@ def test_many_differences_are_counted() -> None:
     found = other.differences(_MANIFEST)
     assert len(found) < 10
     assert "36 more" in found[-1]
-
-
-@pytest.mark.parametrize(
-    ("seen", "leaked"),
-    [
-        (Split("synthetic", ("0001", "0000", "0007"), (), 0), ["0000", "0001"]),
-        (Split("synthetic", ("0001",), (), None), ["0001"]),
-        (Split("synthetic", ("0001",), (), 1), []),
-        (Split("co3d", ("0001",), (), None), []),
-        (Split("synthetic", ("0002",), ("0001",), 0), []),
-    ],
-)
-def test_a_capture_leaks_if_it_is_held_out_here_and_trained_on_there(
-    seen: Split, leaked: list[str]
-) -> None:
-    found = _MANIFEST.leaked_from(replace(_MANIFEST, split={"hydrant": seen}))
-    assert found == ({"hydrant": leaked} if leaked else {})
-    assert _MANIFEST.leaked_from(replace(_MANIFEST, split={"apple": seen})) == {}
