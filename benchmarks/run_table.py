@@ -24,9 +24,9 @@ from benchmarks.run.cells import (
     Cell,
     CellJob,
     Plan,
+    failed_output,
     keep_output,
     score_cell,
-    write_failure,
     write_plan,
 )
 from benchmarks.run.method_content import MISSING_WEIGHTS, is_ours, method_contents
@@ -167,7 +167,7 @@ def _make(jobs: Sequence[CellJob], making: Making, folder: TableFolder) -> list[
             scene = Scene.open(job.scene)
             size = scene.record.image_size
             output = check_output(result, len(scene.draw.targets), size, job.method.name)
-            cells[index] = keep_output(job, output, truths_apart=True)
+            cells[index] = keep_output(job, output)
             reason = f": {cells[index].reason}" if cells[index].status == FAILED else ""
             bar.advance(note=f"{job.method.name} {cells[index].status}{reason}")
     return [cells[index] for index in range(len(jobs))]
@@ -179,7 +179,7 @@ def _score(jobs: Sequence[CellJob], launcher: Launcher) -> list[Cell]:
     with progress("scoring", len(jobs), "cells") as bar:
         for index, result in launcher.run(score_cell, jobs):
             if isinstance(result, Died):
-                result = write_failure(jobs[index], result.reason)
+                result = keep_output(jobs[index], failed_output(result.reason))
             cells.append(result)
             bar.advance()
     return cells

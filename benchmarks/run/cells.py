@@ -221,7 +221,12 @@ class CellJob:
     """A cell with the very same images, which only need scoring."""
 
 
-def _record(job: CellJob, output: MethodOutput, *, truths_apart: bool = False) -> Cell:
+def failed_output(reason: str) -> CheckedOutput:
+    """In place of the output of a method, or of a scoring, that gave none."""
+    return CheckedOutput(MethodOutput(status=FAILED, reason=reason))
+
+
+def _record(job: CellJob, output: MethodOutput, *, truths_apart: bool) -> Cell:
     """The record of what a method made for a job."""
     measured = {each.name: getattr(output, each.name) for each in fields(MethodOutput)}
     return Cell(
@@ -237,10 +242,11 @@ def _record(job: CellJob, output: MethodOutput, *, truths_apart: bool = False) -
     )
 
 
-def keep_output(job: CellJob, result: CheckedOutput, truths_apart: bool) -> Cell:
-    """Write the cell of what a method has made, unscored, or of why it has not."""
-    is_made = result.output.status == MADE
-    record = _record(job, result.output, truths_apart=truths_apart and is_made)
+def keep_output(job: CellJob, result: CheckedOutput) -> Cell:
+    """Write the cell of what a method has made while no truth was there, unscored, or of why it
+    has not.
+    """
+    record = _record(job, result.output, truths_apart=result.output.status == MADE)
     images = {f"{index}.png": png_bytes(pixels) for index, pixels in enumerate(result.images)}
     points = {}
     if result.points is not None:
@@ -267,11 +273,6 @@ def score_cell(job: CellJob) -> Cell:
     except ValueError as error:
         record = replace(record, status=FAILED, reason=one_line(f"not scored: {error}"))
     return write_cell(job.folder, record, images, points)
-
-
-def write_failure(job: CellJob, reason: str) -> Cell:
-    """Write the cell of a job whose process ended without a record."""
-    return write_cell(job.folder, _record(job, MethodOutput(status=FAILED, reason=reason)), {}, {})
 
 
 def write_cell(

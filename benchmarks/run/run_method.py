@@ -28,6 +28,7 @@ from benchmarks.run.cells import (
     CellJob,
     CheckedOutput,
     MethodOutput,
+    failed_output,
     one_line,
 )
 from extrap_train.config import MethodConfig
@@ -58,13 +59,13 @@ def run_method(job: CellJob) -> bytes:
             method = build_method(job.method)
             weight_paths(method, inputs.category)  # what fails there is no sound method's
             synthesis = method.synthesize(inputs)
-        return _packed(synthesis, inputs, job.method, watch.seconds, memory.mib)
+        return _pack_synthesis(synthesis, inputs, job.method, watch.seconds, memory.mib)
     except Unavailable as error:
-        return pack_output(MethodOutput(status=UNAVAILABLE, reason=str(error)))
+        return _pack({"status": UNAVAILABLE, "reason": one_line(str(error))})
     except BaseException as error:  # SystemExit and KeyboardInterrupt are its own, too
-        reason = f"{type(error).__name__}: {error}"
-        trace = traceback.format_exc()
-        return pack_output(MethodOutput(status=FAILED, reason=reason, traceback=trace))
+        reason = one_line(f"{type(error).__name__}: {error}")
+        trace = _shortened(traceback.format_exc())
+        return _pack({"status": FAILED, "reason": reason, "traceback": trace})
 
 
 def build_method(config: MethodConfig) -> Method:
@@ -82,7 +83,7 @@ def weight_paths(method: Method, category: str) -> list[Path]:
     return [Path(file) for file in files]
 
 
-def _packed(
+def _pack_synthesis(
     synthesis: Synthesis,
     inputs: SceneInputs,
     method: MethodConfig,
@@ -92,10 +93,10 @@ def _packed(
     images, points = synthesis.images, synthesis.points
     _require_floats(images, f"method {method.name}: images")
     require_unit_range(images)
-    arrays = {"images": to_eight_bits(images.permute(0, 2, 3, 1))}
+    arrays = {_IMAGES: to_eight_bits(images.permute(0, 2, 3, 1))}
     if points is not None:
         _require_floats(points, f"method {method.name}: points")
-        arrays["points"] = points.detach().cpu().float().numpy()
+        arrays[_POINTS] = points.detach().cpu().float().numpy()
     assert isinstance(inputs.depth_source, RecordedDepth)
     sharing = len(inputs.targets.world_to_cam) if method.time == PER_IMAGE else 1
     values = {
@@ -107,14 +108,17 @@ def _packed(
         "counts": dict(synthesis.counts),
     }
     try:
-        return pack_output(parse_output(json.dumps(values)), arrays)
+        return _pack(values, arrays)
     except TypeError as error:
-        raise InputError(
-            f"method {method.name}: seconds, given and counts take plain numbers and texts "
-            f"({error})"
-        ) from None
-    except InputError as error:
-        raise InputError(f"method {method.name}: {error}") from None
+        reason = f"seconds, given and counts take plain numbers and texts ({error})"
+        raise InputError(f"method {method.name}: {reason}") from None
+
+
+def _pack(values: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = None) -> bytes:
+    """Bytes for `check_output`; written by the process that is not trusted."""
+    record = np.frombuffer(json.dumps(values).encode(), np.uint8)
+    contents = {name: np.ascontiguousarray(array) for name, array in (arrays or {}).items()}
+    return safetensors.numpy.save({**contents, _RECORD: record})
 
 
 class PeakMemory:
@@ -154,31 +158,14 @@ _RECORD, _IMAGES, _POINTS = "record", "images", "points"
 _KIND = TypeAdapter(MethodOutput)
 
 
-def parse_output(content: str | bytes) -> MethodOutput:
-    """The output in JSON; InputError names the first entry that is wrong."""
-    try:
-        return _KIND.validate_json(content, strict=True)
-    except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        raise InputError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
-
-
-def pack_output(output: MethodOutput, arrays: Mapping[str, np.ndarray] | None = None) -> bytes:
-    """Bytes for `check_output`; written by the process that is not trusted."""
-    record = np.frombuffer(_KIND.dump_json(_clean(output)), np.uint8)
-    contents = {name: np.ascontiguousarray(array) for name, array in (arrays or {}).items()}
-    return safetensors.numpy.save({**contents, _RECORD: record})
-
-
 def check_output(result: bytes | Died, targets: int, side: int, name: str) -> CheckedOutput:
     """A method's result if it is sound and as it was asked for, else a failure with the reason."""
     if isinstance(result, Died):
-        return CheckedOutput(MethodOutput(status=FAILED, reason=result.reason))
+        return failed_output(result.reason)
     try:
         return _checked(result, (targets, side, side, 3))
     except InputError as error:
-        reason = one_line(f"method {name}: {error}")
-        return CheckedOutput(MethodOutput(status=FAILED, reason=reason))
+        return failed_output(one_line(f"method {name}: {error}"))
 
 
 def _checked(result: bytes, wanted: tuple[int, ...]) -> CheckedOutput:
@@ -187,7 +174,7 @@ def _checked(result: bytes, wanted: tuple[int, ...]) -> CheckedOutput:
         content = arrays.pop(_RECORD).tobytes()
     except (safetensors.SafetensorError, KeyError, ValueError, TypeError, AttributeError) as error:
         raise InputError(f"returned no result ({type(error).__name__})") from None
-    output = _clean(parse_output(content))
+    output = _parse(content)
     if output.status == OK:
         raise InputError("claims to be scored already")
     if output.status != MADE:
@@ -207,19 +194,26 @@ def _checked(result: bytes, wanted: tuple[int, ...]) -> CheckedOutput:
     return CheckedOutput(output, [*images], points)
 
 
-def _clean(output: MethodOutput) -> MethodOutput:
-    """Every text printable and of a length for a table."""
+def _parse(content: bytes) -> MethodOutput:
+    """The output in JSON, every text printable and of a length for a table; InputError names the
+    first entry that is wrong.
+    """
+    try:
+        output = _KIND.validate_json(content, strict=True)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        raise InputError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
     if len(output.given) + len(output.counts) > _MAX_WORDS:
         raise InputError(f"given and counts have more than {_MAX_WORDS} entries")
     return replace(
         output,
         reason=one_line(output.reason),
-        traceback=_lines(output.traceback),
+        traceback=_shortened(output.traceback),
         given={one_line(key): one_line(value) for key, value in output.given.items()},
         counts={one_line(key): value for key, value in output.counts.items()},
     )
 
 
-def _lines(text: str) -> str:
+def _shortened(text: str) -> str:
     lines = text.splitlines()[-_MAX_TRACEBACK_LINES:]
     return "\n".join(" " * (len(one) - len(one.lstrip())) + one_line(one) for one in lines)
