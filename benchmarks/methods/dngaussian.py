@@ -7,12 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor, nn
 
-from benchmarks.methods.gaussian_method import (
-    MONOCULAR,
-    GaussianMethod,
-    monocular_source,
-    prior_depths,
-)
+from benchmarks.methods.gaussian_method import MonocularMethod
 from extrap_train.config.options import option
 from extrap_train.gaussians.density import remove
 from extrap_train.gaussians.gaussian_model import GaussianParameters, Gaussians, sh_basis
@@ -39,55 +34,16 @@ side of its cube in extents.
 _GRID_RATE, _NETWORK_RATE = 5e-3, 5e-4
 
 
-@dataclass(frozen=True)
-class DnGaussian(GaussianMethod):
-    """Random points, moved by depth first.
-
-    Published values are those for Blender's scenes, whose cameras too stand around an object.
-    Two things differ: depth steps are taken in every iteration, not every tenth, and what stands
-    right before a camera is removed as in the released training for LLFF. Terms that are published
-    for LLFF alone (smooth depth; round, small and opaque Gaussians) are left out.
+class DnGaussianRecipe(Recipe):
+    """Hard depth moves means, soft depth opacities, and the photograph everything: three optimiser
+    steps an iteration.
     """
 
-    full_iterations: int = 6000
-    init: str = "random"
-    l1_weight: float = 1.0
-    densify_until: int = 6000
-    densify_gradient: float = 5e-4
-    densify_least_opacity: float = 0.1
-    prune_opacity: float = 0.01
-    reset_every: int = 0
+    options: "DnGaussian"
 
-    monocular: str = option(
-        "surrogate",
-        "monocular depth: the depth source under an unknown affine map, or as it is",
-        known=MONOCULAR,
-    )
-    soft_from: int = option(1000, "iteration from which opacities follow depth", low=0)
-    clear_every: int = option(
-        25,
-        "iterations after which Gaussians right before a camera, and unseen ones, are removed: "
-        "patches know no absolute depth, and a shell there satisfies them all",
-        low=0,
-    )
-    hash_levels: int = option(16, "levels of the hash grid", low=2, high=32)
-    hash_log2_size: int = option(19, "entries of a level's table, as a power of 2", low=1, high=30)
-
-    def recipe(self, scene: TrainingScene) -> Recipe:
-        """Three optimiser steps an iteration."""
-        return DnGaussianRecipe(self, scene)
-
-
-class DnGaussianRecipe(Recipe):
-    """Hard depth moves means, soft depth opacities, and the photograph everything."""
-
-    options: DnGaussian
-
-    def __init__(self, options: DnGaussian, scene: TrainingScene) -> None:
+    def __init__(self, options: "DnGaussian", scene: TrainingScene) -> None:
         super().__init__(options, scene)
-        source = monocular_source(scene, options.monocular)
-        priors = prior_depths(scene, source, options.device)
-        self._priors = [fill_unknown(prior) for prior in priors]
+        self._priors = [fill_unknown(prior) for prior in options.priors(scene)[1]]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(scene.seed)
             finest = round(_FINEST_CELLS * _BOUND)
@@ -172,6 +128,38 @@ class DnGaussianRecipe(Recipe):
             term = patch_depth_loss(depth, prior, int(drawn), local, _DEPTH_TOLERANCE)
             loss = loss + weight * term
         return loss
+
+
+@dataclass(frozen=True)
+class DnGaussian(MonocularMethod):
+    """Random points, moved by depth first.
+
+    Published values are those for Blender's scenes, whose cameras too stand around an object.
+    Two things differ: depth steps are taken in every iteration, not every tenth, and what stands
+    right before a camera is removed as in the released training for LLFF. Terms that are published
+    for LLFF alone (smooth depth; round, small and opaque Gaussians) are left out.
+    """
+
+    recipe = DnGaussianRecipe
+
+    full_iterations: int = 6000
+    init: str = "random"
+    l1_weight: float = 1.0
+    densify_until: int = 6000
+    densify_gradient: float = 5e-4
+    densify_least_opacity: float = 0.1
+    prune_opacity: float = 0.01
+    reset_every: int = 0
+
+    soft_from: int = option(1000, "iteration from which opacities follow depth", low=0)
+    clear_every: int = option(
+        25,
+        "iterations after which Gaussians right before a camera, and unseen ones, are removed: "
+        "patches know no absolute depth, and a shell there satisfies them all",
+        low=0,
+    )
+    hash_levels: int = option(16, "levels of the hash grid", low=2, high=32)
+    hash_log2_size: int = option(19, "entries of a level's table, as a power of 2", low=1, high=30)
 
 
 _PRIMES = (1, 2_654_435_761, 805_459_861)

@@ -8,12 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from benchmarks.methods.gaussian_method import (
-    MONOCULAR,
-    GaussianMethod,
-    monocular_source,
-    prior_depths,
-)
+from benchmarks.methods.gaussian_method import MonocularMethod
 from extrap_train.config.options import option
 from extrap_train.errors import InputError
 from extrap_train.gaussians.gaussian_model import GaussianParameters, from_tensors
@@ -22,59 +17,20 @@ from extrap_train.gaussians.losses import pearson_depth_loss
 from extrap_train.gaussians.rasterize import Drawing
 from extrap_train.gaussians.recipe import Recipe, Training
 from extrap_train.gaussians.training_scene import TrainingScene
+from extrap_train.geometry.orbits import looking_at
 from extrap_train.views import Camera, View
 
 NEIGHBOURS = 3
 
 
-@dataclass(frozen=True)
-class Fsgs(GaussianMethod):
-    """3DGS with unpooling, a depth correlation loss, and views that nobody photographed."""
-
-    full_iterations: int = 10_000
-    sh_every: int = 500
-    densify_until: int = 10_000
-    densify_gradient: float = 5e-4
-    reset_first: int = 2001
-    reset_opacity: float = 0.05
-
-    monocular: str = option(
-        "surrogate",
-        "monocular depth: the depth source under an unknown affine map, or as it is",
-        known=MONOCULAR,
-    )
-    unpool_until: int = option(2000, "last iteration with unpooling", low=0)
-    unpool_proximity: float = option(
-        0.01,
-        "least mean squared distance to three neighbours, in squared extents (published: 5 in "
-        "LLFF's squared units, which is above anything in a scene of extent 1)",
-        low=0,
-    )
-    unpool_scale: float = option(
-        0.05, "least scale of a source (published: 1 extent of LLFF's forward-facing rigs)", low=0
-    )
-    depth_weight: float = option(0.05, "weight of the depth correlation", low=0)
-    late_depth_weight: float = option(0.001, "the same from late_from on", low=0)
-    late_from: int = option(9500, "iteration from which there are no pseudo views", low=0)
-    pseudo_from: int = option(2000, "iteration from which there are pseudo views", low=0)
-    pseudo_every: int = option(10, "iterations between two pseudo views", low=1)
-    pseudo_ramp: int = option(500, "iterations over which their weight grows", low=0)
-    pseudo_weight: float = option(0.5, "weight of their depth correlation", low=0)
-
-    def recipe(self, scene: TrainingScene) -> Recipe:
-        """3DGS's with three additions."""
-        return FsgsRecipe(self, scene)
-
-
 class FsgsRecipe(Recipe):
     """Depth correlation on inputs and pseudo views, and unpooling before the usual growth."""
 
-    options: Fsgs
+    options: "Fsgs"
 
-    def __init__(self, options: Fsgs, scene: TrainingScene) -> None:
+    def __init__(self, options: "Fsgs", scene: TrainingScene) -> None:
         super().__init__(options, scene)
-        self._monocular = monocular_source(scene, options.monocular)
-        self._priors = prior_depths(scene, self._monocular, options.device)
+        self._monocular, self._priors = options.priors(scene)
         # A source whose depth comes with the data has none for a view that was never photographed.
         self._predicts = self._monocular.image_size is not None
         scene.record["pseudo views"] = "yes" if self._predicts else "no: depth comes with the data"
@@ -126,6 +82,38 @@ class FsgsRecipe(Recipe):
         training.statistics.follow(all_kept, len(new))
         if limited:
             self.scene.record["unpooling"] = f"stopped at {options.max_gaussians} Gaussians"
+
+
+@dataclass(frozen=True)
+class Fsgs(MonocularMethod):
+    """3DGS with unpooling, a depth correlation loss, and views that nobody photographed."""
+
+    recipe = FsgsRecipe
+
+    full_iterations: int = 10_000
+    sh_every: int = 500
+    densify_until: int = 10_000
+    densify_gradient: float = 5e-4
+    reset_first: int = 2001
+    reset_opacity: float = 0.05
+
+    unpool_until: int = option(2000, "last iteration with unpooling", low=0)
+    unpool_proximity: float = option(
+        0.01,
+        "least mean squared distance to three neighbours, in squared extents (published: 5 in "
+        "LLFF's squared units, which is above anything in a scene of extent 1)",
+        low=0,
+    )
+    unpool_scale: float = option(
+        0.05, "least scale of a source (published: 1 extent of LLFF's forward-facing rigs)", low=0
+    )
+    depth_weight: float = option(0.05, "weight of the depth correlation", low=0)
+    late_depth_weight: float = option(0.001, "the same from late_from on", low=0)
+    late_from: int = option(9500, "iteration from which there are no pseudo views", low=0)
+    pseudo_from: int = option(2000, "iteration from which there are pseudo views", low=0)
+    pseudo_every: int = option(10, "iterations between two pseudo views", low=1)
+    pseudo_ramp: int = option(500, "iterations over which their weight grows", low=0)
+    pseudo_weight: float = option(0.5, "weight of their depth correlation", low=0)
 
 
 def unpool(
@@ -191,23 +179,12 @@ def pseudo_camera(
     center = center + jitter * center.norm() * noise
     forward = (1 - share) * a.forward + share * b.forward
     down = (1 - share) * a.world_to_cam[1, :3] + share * b.world_to_cam[1, :3]
-    return replace(a, world_to_cam=look_along(center, forward, down))
+    eye, seen, up = (x.double().numpy(force=True) for x in (center, center + forward, -down))
+    pose = looking_at(eye[None], seen, up)[0]
+    return replace(a, world_to_cam=torch.from_numpy(pose).to(a.world_to_cam))
 
 
 def _on_arc(a: Float[Tensor, "3"], b: Float[Tensor, "3"], share: float) -> Float[Tensor, "3"]:
     straight = (1 - share) * a + share * b
     radius = (1 - share) * a.norm() + share * b.norm()
     return straight / straight.norm().clamp_min(1e-6) * radius
-
-
-def look_along(
-    center: Float[Tensor, "3"], forward: Float[Tensor, "3"], down: Float[Tensor, "3"]
-) -> Float[Tensor, "4 4"]:
-    """world_to_cam of a camera at `center`; `down` need not be square to `forward`."""
-    z = forward / forward.norm()
-    x = torch.linalg.cross(down, z)
-    x = x / x.norm()
-    rotation = torch.stack([x, torch.linalg.cross(z, x), z])
-    world_to_cam = torch.eye(4).to(center)
-    world_to_cam[:3, :3], world_to_cam[:3, 3] = rotation, -rotation @ center
-    return world_to_cam

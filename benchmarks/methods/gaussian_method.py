@@ -1,15 +1,16 @@
 """A Gaussian method as a row of a table."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis, photographs_used
+from extrap_train.config.options import option
 from extrap_train.depth import DepthSource
 from extrap_train.depth.surrogate import AffineSurrogate
 from extrap_train.gaussians.fit import Fit, fit
@@ -18,17 +19,13 @@ from extrap_train.gaussians.init import Points, parameters_from_points
 from extrap_train.gaussians.recipe import Recipe
 from extrap_train.gaussians.training_scene import TrainingScene, training_scene
 
-MONOCULAR = ("surrogate", "depth_source")
-"""Known values of a method's option `monocular`."""
-
 
 @dataclass(frozen=True)
-class GaussianMethod(GaussianOptions, ABC):
-    """Fits Gaussians to the inputs and draws the targets; a subclass names its recipe."""
+class GaussianMethod(GaussianOptions):
+    """Fits Gaussians to the inputs and draws the targets; a subclass may have its own recipe."""
 
-    @abstractmethod
-    def recipe(self, scene: TrainingScene) -> Recipe:
-        """What the method does in the training loop."""
+    recipe: ClassVar[type[Recipe]] = Recipe
+    """What the method does in the training loop."""
 
     def weight_files(self, category: str) -> Sequence[Path]:
         """None."""
@@ -36,7 +33,8 @@ class GaussianMethod(GaussianOptions, ABC):
 
     def fit_scene(self, inputs: SceneInputs) -> Fit:
         """The scene that the inputs alone make; the targets are not looked at."""
-        return fit(self.recipe(training_scene(inputs.views, inputs.depth_source, inputs.seed)))
+        scene = training_scene(inputs.views, inputs.depth_source, inputs.seed)
+        return fit(self.recipe(self, scene))
 
     def synthesize(self, inputs: SceneInputs) -> Synthesis:
         """Fit, and draw every target; the time is that of preprocessing and optimisation."""
@@ -65,26 +63,28 @@ class GaussianMethod(GaussianOptions, ABC):
         recipe.draw(learnt, recipe.camera(0)).image.sum().backward()
 
 
-def monocular_source(scene: TrainingScene, name: str) -> DepthSource:
-    """`surrogate` (the scene's depth source under an unknown affine map) or `depth_source` itself.
+@dataclass(frozen=True)
+class MonocularMethod(GaussianMethod):
+    """One that is also told a monocular network's depth, or what stands for it."""
 
-    The second is for benchmarks whose depth source is a monocular network. The record says which.
-    """
-    if name == "depth_source":
+    monocular: str = option(
+        "surrogate",
+        "monocular depth: the depth source under an unknown affine map, or as it is",
+        known=("surrogate", "depth_source"),
+    )
+
+    def priors(self, scene: TrainingScene) -> tuple[DepthSource, list[Float[Tensor, "h w"]]]:
+        """The source, and by it the depth of every input up to an affine map; 0 where unknown.
+
+        The record says which source, and in how many inputs there is any depth: in others, depth
+        losses are silent.
+        """
+        source: DepthSource = scene.depth_source
         scene.record["monocular"] = "the depth source"
-        return scene.depth_source
-    scene.record["monocular"] = "surrogate: the depth source under an unknown affine map"
-    return AffineSurrogate(scene.depth_source, scene.seed)
-
-
-def prior_depths(
-    scene: TrainingScene, source: DepthSource, device: str
-) -> list[Float[Tensor, "h w"]]:
-    """Depth of every input view up to an affine map, on `device`; 0 where it is unknown.
-
-    The record says in how many inputs there is any: in others, depth losses are silent.
-    """
-    priors = [found.reliable() for found in source.depth_maps(scene.given)]
-    known = sum(bool((prior > 0).any()) for prior in priors)
-    scene.record["monocular depth"] = f"in {known} of {len(priors)} inputs"
-    return [prior.to(device) for prior in priors]
+        if self.monocular == "surrogate":
+            source = AffineSurrogate(source, scene.seed)
+            scene.record["monocular"] = "surrogate: the depth source under an unknown affine map"
+        found = [depth.reliable() for depth in source.depth_maps(scene.given)]
+        known = sum(bool((depth > 0).any()) for depth in found)
+        scene.record["monocular depth"] = f"in {known} of {len(found)} inputs"
+        return source, [depth.to(self.device) for depth in found]

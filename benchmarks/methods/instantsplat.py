@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import roma
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -21,41 +22,12 @@ _STEADY, _LOOSE = 1.0, 100.0
 """Step of a mean at full confidence, and at none."""
 
 
-@dataclass(frozen=True)
-class InstantSplat(GaussianMethod):
-    """One point per pixel, no densification, high learning rates, joint pose refinement."""
-
-    full_iterations: int = 1000
-    init: str = "dense"
-    init_points: int = 100_000
-    max_gaussians: int = 100_000
-    sh_degree: int = 0
-    means_rate_final: float = 1.372e-4
-    """1.6e-4 → 1.6e-6 over 30,000 iterations, of which 1000 are run: 1.6e-4 · 0.01^(1 / 30)."""
-    sh_dc_rate: float = 0.025
-    log_scales_rate: float = 0.05
-    quats_rate: float = 0.01
-    densify_until: int = 0
-    reset_every: int = 0
-
-    covisibility: float = option(
-        0.01, "share of a view's depth range within which surfaces are the same; 0: keep all", low=0
-    )
-    confidence_rates: bool = option(True, "whether unsure points move faster")
-    pose_rate: float = option(1e-4, "learning rate of the input poses; 0: they stay", low=0)
-    pose_rate_final: float = option(1e-6, "the same at the end", low=0)
-
-    def recipe(self, scene: TrainingScene) -> Recipe:
-        """3DGS's loop without its growth."""
-        return InstantSplatRecipe(self, scene)
-
-
 class InstantSplatRecipe(Recipe):
     """Dense points less those seen twice; their confidence and the poses take part."""
 
-    options: InstantSplat
+    options: "InstantSplat"
 
-    def __init__(self, options: InstantSplat, scene: TrainingScene) -> None:
+    def __init__(self, options: "InstantSplat", scene: TrainingScene) -> None:
         super().__init__(options, scene)
         self._poses = PoseCorrections(len(scene.views)).to(options.device)
 
@@ -90,6 +62,33 @@ class InstantSplatRecipe(Recipe):
         """Moved as the input cameras have moved on the whole."""
         refined = [self.camera(index) for index in range(len(self.cameras))]
         return similarity_between(self.cameras, refined).camera(cameras)
+
+
+@dataclass(frozen=True)
+class InstantSplat(GaussianMethod):
+    """One point per pixel, no densification, high learning rates, joint pose refinement."""
+
+    recipe = InstantSplatRecipe
+
+    full_iterations: int = 1000
+    init: str = "dense"
+    init_points: int = 100_000
+    max_gaussians: int = 100_000
+    sh_degree: int = 0
+    means_rate_final: float = 1.372e-4
+    """1.6e-4 → 1.6e-6 over 30,000 iterations, of which 1000 are run: 1.6e-4 · 0.01^(1 / 30)."""
+    sh_dc_rate: float = 0.025
+    log_scales_rate: float = 0.05
+    quats_rate: float = 0.01
+    densify_until: int = 0
+    reset_every: int = 0
+
+    covisibility: float = option(
+        0.01, "share of a view's depth range within which surfaces are the same; 0: keep all", low=0
+    )
+    confidence_rates: bool = option(True, "whether unsure points move faster")
+    pose_rate: float = option(1e-4, "learning rate of the input poses; 0: they stay", low=0)
+    pose_rate_final: float = option(1e-6, "the same at the end", low=0)
 
 
 def confidence_factor(confidence: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
@@ -184,9 +183,7 @@ def similarity_between(given: Sequence[Camera], refined: Sequence[Camera]) -> Si
         b.world_to_cam[:3, :3].T @ a.world_to_cam[:3, :3]
         for a, b in zip(given, refined, strict=True)
     ]
-    u, _, vh = torch.linalg.svd(torch.stack(turns).double().sum(0))
-    flip = torch.diag(u.new_tensor([1.0, 1.0, float(torch.det(u @ vh).sign())]))
-    rotation = (u @ flip @ vh).to(turns[0])
+    rotation = roma.special_procrustes(torch.stack(turns).double().sum(0)).to(turns[0])
     source = torch.stack([camera.center for camera in given]) @ rotation.T
     target = torch.stack([camera.center for camera in refined])
     a, b = source - source.mean(0), target - target.mean(0)

@@ -75,7 +75,8 @@ def _left_of(positions: torch.Tensor) -> torch.Tensor:
     """What DNGaussian's clearing leaves of tiny Gaussians at these places of the frame."""
     inputs, _ = scene_inputs(size=32)
     scene = training_scene(inputs.views, inputs.depth_source, seed=0)
-    recipe = DnGaussian(iterations=100, full_iterations=100, densify_until=0).recipe(scene)
+    options = DnGaussian(iterations=100, full_iterations=100, densify_until=0)
+    recipe = options.recipe(options, scene)
     count = len(positions)
     points = Points(positions, torch.rand(count, 3), torch.ones(count))
     training = Training(

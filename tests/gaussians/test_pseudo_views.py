@@ -46,7 +46,7 @@ class _Network(DatasetDepth):
 
 def _under_way(network: _Network) -> tuple[FsgsRecipe, Training]:
     inputs, _ = scene_inputs(size=16)
-    recipe = OPTIONS.recipe(training_scene(inputs.views, network, seed=0))
+    recipe = OPTIONS.recipe(OPTIONS, training_scene(inputs.views, network, seed=0))
     assert isinstance(recipe, FsgsRecipe)
     start = parameters_from_points(recipe.initial_points(), 0, 0.5, widest=0.1)
     return recipe, Training(
