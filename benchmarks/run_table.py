@@ -1,16 +1,18 @@
 """Run a table: what is missing is made and scored, what is there is used, reports are written."""
 
+import math
 import os
 import shutil
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from functools import partial
 from pathlib import Path
-from statistics import median
 
+import numpy as np
+import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
@@ -242,46 +244,41 @@ def print_plan(
     """What would run, how long, and what is missing: a method's weights, and the networks without
     which a column stays empty.
     """
-    making, scoring = _seconds_by_method(folder)
-    everywhere = [second for seconds in scoring.values() for second in seconds]
+    known = _seconds_of_cells(folder)
+    typical = known.groupby("method").median()
     shown = Table("method", "cells", "to make", "to score", "seconds a cell", "missing")
     total, unknown = 0.0, []
     for name in dict.fromkeys(job.method.name for job in jobs):
-        mine = [job for job in jobs if job.method.name == name]
-        to_make, to_score = (
-            sum(job.method.name == name for job in part) for part in (left.to_make, left.to_score)
+        mine, to_make, to_score = (
+            [job for job in part if job.method.name == name]
+            for part in (jobs, left.to_make, left.to_score)
         )
-        make_s, score_s = making[name], scoring[name] or everywhere
-        if (to_make and not make_s) or (to_score and not score_s):
+        make_s, score_s = typical.loc[name] if name in typical.index else (math.nan, math.nan)
+        score_s = known["scoring"].median() if math.isnan(score_s) else score_s
+        if (to_make and math.isnan(make_s)) or (to_score and math.isnan(score_s)):
             unknown.append(name)
-        each = median(make_s or [0.0]), median(score_s or [0.0])
-        total += each[0] * to_make + each[1] * (to_make + to_score)
+        seconds = np.nan_to_num([make_s, score_s])
+        total += seconds @ [len(to_make), len(to_make) + len(to_score)]
+        rate = "not yet known" if math.isnan(make_s) else f"{seconds.sum():.1f}"
         weights = mine[0].made_from.inputs["weights"]
-        is_missing = weights.startswith(MISSING_WEIGHTS)
-        missing = weights.removeprefix(MISSING_WEIGHTS) if is_missing else ""
-        rate = f"{sum(each):.1f}" if make_s else "not yet known"
-        shown.add_row(name, *map(str, (len(mine), to_make, to_score)), rate, missing)
+        missing = weights.partition(MISSING_WEIGHTS)[2]
+        shown.add_row(name, *(str(len(part)) for part in (mine, to_make, to_score)), rate, missing)
     console.print(shown)
     for column, reason in missing_networks(jobs[0].scoring).items():
         console.print(f"{column} stays empty: {reason}")
     duration = timedelta(seconds=round(total))
-    known = [f"about {duration} (h:mm:ss) of one core"] if total or not unknown else []
-    more = [f"no finished cell tells how long {', '.join(unknown)} will take"] if unknown else []
-    console.print("; ".join([*known, *more]))
+    said = [f"about {duration} (h:mm:ss) of one core"] if total or not unknown else []
+    said += [f"no finished cell tells how long {', '.join(unknown)} will take"] if unknown else []
+    console.print("; ".join(said))
 
 
-def _seconds_by_method(
-    folder: TableFolder,
-) -> tuple[dict[str, list[float]], dict[str, list[float]]]:
+def _seconds_of_cells(folder: TableFolder) -> pd.DataFrame:
     """What making and scoring each finished cell took, of any options."""
-    making, scoring = defaultdict(list), defaultdict(list)
+    rows = []
     for file in folder.cells.glob("*/cell.json"):
-        try:
+        with suppress(InputError):
             cell = read_record(file, Cell, "")
-        except InputError:
-            continue
-        if cell.images:
-            making[cell.method].append(cell.wall_seconds)
-        if cell.scoring_seconds is not None:
-            scoring[cell.method].append(cell.scoring_seconds)
-    return making, scoring
+            making = cell.wall_seconds if cell.images else None
+            rows.append((cell.method, making, cell.scoring_seconds))
+    frame = pd.DataFrame(rows, columns=["method", "making", "scoring"])
+    return frame.astype({"making": float, "scoring": float})

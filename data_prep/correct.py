@@ -67,34 +67,35 @@ def correct_pair(reference: View, query: View, matcher: Matcher, grid: int) -> C
     `grid` is the number of control points along each side of the flow.
     """
     camera, before = query.camera, draw(reference, query.camera)
-    error = photometric_error(before, query.image)
+    as_it_is = photometric_error(before, query.image)
+
+    def leave(reason: str) -> Correction:
+        return Correction(None, as_it_is, as_it_is, reason)
+
     matches = matcher.match(before.image[0], query.image, before.mask[0] > 0)
     if len(matches) < LEAST_MATCHES:
-        return Correction(None, error, error, f"only {len(matches)} matches")
+        return leave(f"only {len(matches)} matches")
     chosen = torch.linspace(0, len(matches) - 1, min(len(matches), MOST_MATCHES)).long()
     matches = matches[chosen]
     steps = matches.first_to_second
     across = float(steps_across(matches.first, steps, reference.camera, camera).median())
     if across > LARGEST_ACROSS * max(camera.width, camera.height):
-        reason = f"the matches lie {across:.1f} px off their epipolar lines"
-        return Correction(None, error, error, reason)
+        return leave(f"the matches lie {across:.1f} px off their epipolar lines")
     size = torch.tensor([camera.width, camera.height])
     positions, steps = matches.first / size * 2 - 1, steps / size * 2
     flow, inliers = fit_flow(positions, steps, matches.confidence, grid)
     share = float(inliers.float().mean())
     if share < LEAST_INLIERS:
-        return Correction(None, error, error, f"{share:.0%} of the matches move together")
+        return leave(f"{share:.0%} of the matches move together")
     positions, steps, weights = positions[inliers], steps[inliers], matches.confidence[inliers]
-    if not _explains(flow, positions, steps):
-        return Correction(None, error, error, "the matches have no motion in common")
+    left = (steps - flow_at(flow, positions)).norm(dim=1).median()
+    if not left < steps.norm(dim=1).median():  # no nearer to where they belong than before
+        return leave("the matches have no motion in common")
     if float((steps * size / 2).norm(dim=1).median()) < LEAST_STEP:
-        return Correction(None, error, error, "the matches hardly move")
+        return leave("the matches hardly move")
     flows = [flow, *(least_squares_flow(positions, steps, weights, grid, s) for s in STIFFER)]
-    tried = [_try_flow(before, reference, query, flow) for flow in flows]
-    best = max(tried, key=_gain)
-    if not _gain(best) >= LEAST_GAIN:
-        return Correction(None, error, error, "the picture comes no closer")
-    return best
+    best = max((_try_flow(before, reference, query, flow) for flow in flows), key=_gain)
+    return best if _gain(best) >= LEAST_GAIN else leave("the picture comes no closer")
 
 
 def _try_flow(
@@ -122,14 +123,6 @@ def draw(reference: View, query: Camera, flow: Float[Tensor, "2 g g"] | None = N
         stack_cameras([query]),
         None if flow is None else flow[None, None],
     )
-
-
-def _explains(
-    flow: Float[Tensor, "2 g g"], positions: Float[Tensor, "n 2"], steps: Float[Tensor, "n 2"]
-) -> bool:
-    """Whether the matches lie nearer to where they belong once the warp has moved."""
-    left = (steps - flow_at(flow, positions)).norm(dim=1).median()
-    return bool(left < steps.norm(dim=1).median())
 
 
 def photometric_error(

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
 
 from extrap_train.config import PrepConfig
 from extrap_train.data.camera_check import CO3D_POSES, find_pose_fault, is_degenerate
@@ -64,12 +63,10 @@ def judge(sequence: FrameSequence, options: PrepConfig) -> Verdict:
     if count < least:
         return Verdict(False, f"{count} frames, fewer than {least}", count)
     cameras = stack_poses([frame.camera for frame in sequence.frames])
-    unsound = is_degenerate(cameras).nonzero().flatten().tolist()
-    if unsound:
-        name = sequence.frames[unsound[0]].name
-        return Verdict(
-            False, f"degenerate camera (NaN, no rotation, no focal length): {name}", count
-        )
+    if len(unsound := is_degenerate(cameras).nonzero()):
+        name = sequence.frames[int(unsound[0])].name
+        reason = f"degenerate camera (NaN, no rotation, no focal length): {name}"
+        return Verdict(False, reason, count)
     if fault := find_pose_fault(cameras, CO3D_POSES):
         return Verdict(False, fault, count)
     facing_share = float(facing(cameras, scene_center(cameras), LOOKS_AT_RAD).mean())
@@ -84,15 +81,11 @@ def azimuth_coverage(cameras: Camera) -> tuple[float, float]:
     """Largest gap within the covered arc, and the arc itself, in degrees around the orbit."""
     orbit = fit_orbit(cameras)
     low = np.abs(orbit.elevations_rad) < _MAX_ELEVATION_RAD
-    gaps = _sorted_gaps_deg(orbit.azimuths_rad[low])
+    azimuths = np.degrees(np.sort(orbit.azimuths_rad[low]))
+    gaps = np.sort(np.diff(azimuths, append=azimuths[:1] + 360))
     if len(gaps) < 2:
         return 0.0, 0.0
     return float(gaps[-2]), float(360 - gaps[-1])
-
-
-def _sorted_gaps_deg(azimuths_rad: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    azimuths = np.degrees(np.sort(azimuths_rad))
-    return np.sort(np.diff(azimuths, append=azimuths[:1] + 360))
 
 
 def _quality_reasons(sequence: FrameSequence, options: PrepConfig) -> list[str]:

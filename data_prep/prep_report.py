@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from jinja2 import Environment, Template
+from jinja2 import Environment
 from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
@@ -41,12 +41,16 @@ def write_report(data: PreparedData, console: Console) -> Path:
     _print(facts, reasons, console)
     write_atomic(folder / "histograms.png", as_png(histograms(data)))
     write_atomic(folder / "coverage.png", as_png(coverage(data)))
-    pairs = data.pairs("train")
-    pair_sheet(data, _from_easy_to_hard(pairs, SAMPLES), folder / "pairs.png")
+    by_angle = np.argsort(data.pairs("train").angle_rad, kind="stable")
+    chosen = by_angle[linspace_indices(len(by_angle), SAMPLES)].tolist()
+    pair_sheet(data, chosen, folder / "pairs.png")
     listed = list(dropped[["sequence", "reason"]].head(_LISTED).itertuples(index=False, name=None))
     page = folder / "report.html"
-    content = _page().render(
-        title=f"Prepared data: {', '.join(_categories(data))}",
+    source = files("data_prep").joinpath("templates/report.html").read_text("utf-8")
+    template = Environment(autoescape=True, trim_blocks=True).from_string(source)
+    categories = sorted(set(data.sequences["sequence"].str.partition("/")[0]))
+    content = template.render(
+        title=f"Prepared data: {', '.join(categories)}",
         facts=facts,
         reasons=reasons,
         dropped=listed,
@@ -56,16 +60,6 @@ def write_report(data: PreparedData, console: Console) -> Path:
     write_atomic(page, content.encode())
     console.print(f"report: {page}")
     return page
-
-
-def _page() -> Template:
-    """The page's template; everything that it is filled with is escaped."""
-    source = files("data_prep").joinpath("templates/report.html").read_text("utf-8")
-    return Environment(autoescape=True, trim_blocks=True).from_string(source)
-
-
-def _categories(data: PreparedData) -> list[str]:
-    return sorted({name.split("/", 1)[0] for name in data.sequences["sequence"]})
 
 
 def _reasons(dropped: pd.DataFrame) -> list[tuple[str, int]]:
@@ -133,11 +127,6 @@ def coverage(data: PreparedData) -> Figure:
     axes.set(yticks=[], ylim=(0, len(shown) + 8))
     axes.set_title("azimuths of the frames, a ring a sequence (orange: test)")
     return figure
-
-
-def _from_easy_to_hard(pairs: Pairs, count: int) -> list[int]:
-    order = np.argsort(pairs.angle_rad, kind="stable")
-    return [int(order[place]) for place in linspace_indices(len(pairs), count)]
 
 
 def correction_report(data: PreparedData, folder: Path) -> dict[str, Any]:

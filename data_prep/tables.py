@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from data_prep.filter import Verdict
 from data_prep.sequence_job import PrepContext, SequenceJob, reference_frames
 from data_prep.split import Split
-from extrap_train.data.frame_files import table_digest
+from extrap_train.data.frame_files import SealedTable, table_digest
 from extrap_train.data.prepared import FORMAT, TABLES
 from extrap_train.data.sequences import FrameSequence
 from extrap_train.errors import InputError
@@ -102,9 +102,7 @@ def write_results(
 def _frame_tables(jobs: list[SequenceJob], counts: Counter[str]) -> Iterator[pa.Table]:
     """Each sequence's frames; counts them by sequence."""
     for job in jobs:
-        cameras = job.frames.read()
-        if cameras is None:
-            raise _vanished_error(job)
+        cameras = _read(job.frames)
         counts[job.name] = cameras.num_rows
         references = reference_frames(cameras["depth_share"].to_numpy(), job.is_lone)
         names = pa.array([job.name] * cameras.num_rows, pa.string())
@@ -115,17 +113,18 @@ def _frame_tables(jobs: list[SequenceJob], counts: Counter[str]) -> Iterator[pa.
 def _pair_tables(jobs: list[SequenceJob], counts: Counter[tuple[str, str]]) -> Iterator[pa.Table]:
     """Each sequence's pairs; counts them by sequence and split."""
     for job in jobs:
-        pairs = job.pairs.read()
-        if pairs is None:
-            raise _vanished_error(job)
+        pairs = _read(job.pairs)
         counts.update((job.name, part) for part in pairs["split"].to_pylist())
         yield pairs.replace_schema_metadata(None)
 
 
-def _vanished_error(job: SequenceJob) -> InputError:
-    return InputError(
-        f"{job.frames.file.parent}: vanished or changed meanwhile; run data_prep again"
-    )
+def _read(sealed: SealedTable) -> pa.Table:
+    table = sealed.read()
+    if table is None:
+        raise InputError(
+            f"{sealed.file.parent}: vanished or changed meanwhile; run data_prep again"
+        )
+    return table
 
 
 def _sequence_row(

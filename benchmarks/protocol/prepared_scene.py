@@ -42,7 +42,7 @@ from extrap_train.store.atomic import atomic_folder
 from extrap_train.store.records import read_record
 from extrap_train.views import Camera, View
 
-SCENE_FORMAT: Literal[3] = 3
+SCENE_FORMAT: Literal[4] = 4
 
 INPUTS = "inputs/"
 """What the names of files begin with that methods receive; all others are the truth's."""
@@ -61,25 +61,19 @@ class CameraRecord:
 
 
 @dataclass(frozen=True)
-class Cameras:
-    """Those of the inputs, at the targets' size, and of the targets."""
-
-    inputs: list[CameraRecord]
-    targets: list[CameraRecord]
-
-
-@dataclass(frozen=True)
 class SceneRecord:
     """A prepared draw, `scene.json`."""
 
-    format: Literal[3]
+    format: Literal[4]
     origin: str
     """Digest of all that decides the content."""
     draw: Draw
     image_size: Side
     fine_size: Side
     depth_seconds: Positive
-    cameras: Cameras
+    inputs: list[CameraRecord]
+    """At the targets' size."""
+    targets: list[CameraRecord]
     angles_rad: list[Number]
     """From each target to its nearest input."""
     files: dict[InnerPath, str]
@@ -122,8 +116,8 @@ class Scene:
         file = folder / "scene.json"
         remedy = f"delete {folder} and run the table again"
         record = read_record(file, SceneRecord, remedy)
-        draw, cameras = record.draw, record.cameras
-        views = (len(cameras.inputs), len(cameras.targets), len(record.angles_rad))
+        draw = record.draw
+        views = (len(record.inputs), len(record.targets), len(record.angles_rad))
         if views != (len(draw.inputs), len(draw.targets), len(draw.targets)) or 0 in views:
             raise InputError(f"{file}: has other numbers of cameras than of frames; {remedy}")
         needed = {*_pictures("inputs", draw.inputs), "inputs/depth.npy"}
@@ -140,8 +134,8 @@ class Scene:
     @property
     def data_hash(self) -> str:
         """Of every file and camera in it."""
-        record = self.record
-        return digest([asdict(record.draw), asdict(record.cameras), record.files])
+        kept = asdict(self.record)
+        return digest([kept[part] for part in ("draw", "inputs", "targets", "files")])
 
     @property
     def truth_folder(self) -> Path:
@@ -163,7 +157,7 @@ class Scene:
     def inputs(self) -> SceneInputs:
         """What a method receives; nothing of the truth is read."""
         draw, record = self.draw, self.record
-        cameras = _camera(record.cameras.inputs, record.image_size)
+        cameras = _camera(record.inputs, record.image_size)
         side, size = record.fine_size, record.image_size
         images = self._pictures("inputs", draw.inputs, side)
         depths = self._array("inputs/depth.npy", (len(draw.inputs), side, side))
@@ -184,7 +178,7 @@ class Scene:
     @property
     def target_cameras(self) -> Camera:
         """Where views are to be made."""
-        return _camera(self.record.cameras.targets, self.record.image_size)
+        return _camera(self.record.targets, self.record.image_size)
 
     def truth(self) -> Truth:
         """What the images are scored against."""

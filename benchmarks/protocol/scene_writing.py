@@ -15,7 +15,6 @@ from benchmarks.protocol.prepared_scene import (
     INPUTS,
     SCENE_FORMAT,
     CameraRecord,
-    Cameras,
     Scene,
     SceneRecord,
 )
@@ -29,7 +28,7 @@ from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
 from extrap_train.geometry.warp import compute_warp
 from extrap_train.store.atomic import atomic_folder
 from extrap_train.store.records import write_record
-from extrap_train.views import Camera, View, stack_cameras
+from extrap_train.views import Camera, View, stack_cameras, stack_poses
 
 LOG = logging.getLogger(__name__)
 
@@ -117,11 +116,9 @@ def _scene(
         image_size=size,
         fine_size=fine_size,
         depth_seconds=seconds,
-        cameras=Cameras(
-            inputs=[_camera_record(view.camera.resized(size, size)) for view in inputs],
-            targets=[_camera_record(view.camera) for view in targets],
-        ),
-        angles_rad=_angles_to_nearest([view.resized(size, size) for view in inputs], targets),
+        inputs=[_camera_record(view.camera.resized(size, size)) for view in inputs],
+        targets=[_camera_record(view.camera) for view in targets],
+        angles_rad=_angles_to_nearest(inputs, targets),
         files={name: hashlib.sha256(content).hexdigest() for name, content in contents.items()},
     )
     return contents, record
@@ -158,7 +155,7 @@ def _with_depth(
 
 
 def _angles_to_nearest(inputs: ListOf[View], targets: ListOf[View]) -> list[float]:
-    cameras = stack_cameras([view.camera for view in (*inputs, *targets)])
+    cameras = stack_poses([view.camera for view in (*inputs, *targets)])
     angles = pairwise_angles(cameras, scene_center(cameras))
     return [float(a) for a in angles[len(inputs) :, : len(inputs)].min(1)]
 

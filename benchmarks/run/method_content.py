@@ -6,7 +6,7 @@ module does when it is imported reaches the process that holds the truths and sc
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -34,17 +34,9 @@ class MethodContent:
     code: str
 
 
-@dataclass(frozen=True)
-class _Answer:
-    weights: dict[str, str] = field(default_factory=dict)
-    code: str = ""
-    refused: str = ""
-    """Why the table cannot be made as it was asked for."""
-    failed: str = ""
-    """How the method's own code ended."""
-
-
-_ANSWERS = TypeAdapter(_Answer)
+_CONTENTS = TypeAdapter(MethodContent)
+_REFUSED = b"refused: "
+"""What an answer begins with that says why the table cannot be made as it was asked for."""
 
 
 def method_contents(
@@ -54,15 +46,11 @@ def method_contents(
     that do not fit. A method whose own code fails here fails again when its images are made.
     """
     wanted = tuple(sorted(categories))
+    found = {config.name: _describe(config, wanted) for config in configs if is_ours(config)}
     asked = [(config, wanted) for config in configs if not is_ours(config)]
-    ours = [config for config in configs if is_ours(config)]
-    answers = {config.name: _describe(build_method(config), wanted) for config in ours}
-    for index, result in isolated.run(_describe_apart, asked):
-        answers[asked[index][0].name] = _read_answer(result)
-    refusals = [answer.refused for answer in answers.values() if answer.refused]
-    if refusals:
-        raise InputError(refusals[0])
-    return {config.name: _content(answers[config.name], wanted) for config in configs}
+    for index, answer in [*isolated.run(_describe_apart, asked)]:  # all end before one is refused
+        found[asked[index][0].name] = _read_answer(answer, wanted)
+    return found
 
 
 def is_ours(config: MethodConfig) -> bool:
@@ -70,36 +58,40 @@ def is_ours(config: MethodConfig) -> bool:
     return config.factory.startswith(_OURS)
 
 
-def _content(answer: _Answer, categories: Sequence[str]) -> MethodContent:
-    if not answer.failed:
-        return MethodContent(answer.weights, answer.code)
-    return MethodContent(dict.fromkeys(categories, MISSING_WEIGHTS + answer.failed), making_code())
-
-
-def _describe(method: Method, categories: Sequence[str]) -> _Answer:
+def _describe(config: MethodConfig, categories: Sequence[str]) -> MethodContent:
+    method = build_method(config)
     weights = {category: _weights_digest(method, category) for category in categories}
-    return _Answer(weights, making_code(type(method).__module__))
+    return MethodContent(weights, making_code(type(method).__module__))
+
+
+def _failed(reason: str, categories: Sequence[str]) -> MethodContent:
+    return MethodContent(dict.fromkeys(categories, MISSING_WEIGHTS + reason), making_code())
 
 
 def _describe_apart(asked: tuple[MethodConfig, tuple[str, ...]]) -> bytes:
     """The same in a process of its own: what the method's code raises is a part of the answer."""
     config, categories = asked
     try:
-        answer = _describe(build_method(config), categories)
+        found = _describe(config, categories)
     except InputError as error:
-        answer = _Answer(refused=str(error))
+        return _REFUSED + str(error).encode(errors="replace")
     except BaseException as error:  # SystemExit and KeyboardInterrupt are its own, too
-        answer = _Answer(failed=one_line(f"{type(error).__name__}: {error}"))
-    return _ANSWERS.dump_json(answer)
+        found = _failed(one_line(f"{type(error).__name__}: {error}"), categories)
+    return _CONTENTS.dump_json(found)
 
 
-def _read_answer(result: bytes | Died) -> _Answer:
-    if isinstance(result, Died):
-        return _Answer(failed=result.reason)
+def _read_answer(answer: bytes | Died, categories: Sequence[str]) -> MethodContent:
+    if isinstance(answer, Died):
+        return _failed(answer.reason, categories)
+    if answer.startswith(_REFUSED):
+        raise InputError(one_line(answer.removeprefix(_REFUSED).decode(errors="replace"), 2000))
     try:
-        return _ANSWERS.validate_json(result, strict=True)
+        found = _CONTENTS.validate_json(answer, strict=True)
     except ValidationError:
-        return _Answer(failed="what it says of its weights cannot be read")
+        return _failed("what it says of its weights cannot be read", categories)
+    if found.weights.keys() != {*categories}:
+        return _failed("what it says of its weights cannot be read", categories)
+    return found
 
 
 def _weights_digest(method: Method, category: str) -> str:

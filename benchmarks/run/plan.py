@@ -1,5 +1,6 @@
 """From a table to its cells: protocol, prepared draws, and what each cell is named by."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -7,7 +8,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.protocol.captures import Capture, freeze, open_captures, trained_models
-from benchmarks.protocol.draws import Draw, Protocol
+from benchmarks.protocol.draws import Draw, Protocol, digest
 from benchmarks.protocol.prepared_scene import Scene, truths_of
 from benchmarks.protocol.scene_writing import prepare_scene
 from benchmarks.run.cells import OK, Cell, CellJob, read_cell
@@ -112,12 +113,10 @@ def open_protocol(
 
 def _require_own_names(captures: Iterable[Capture]) -> None:
     """A draw knows its capture by name."""
-    known = set()
-    for capture in captures:
-        name = f"{capture.sequence.category}/{capture.sequence.name}"
-        if name in known:
-            raise InputError(f"two captures are called {name}; rename one's folder")
-        known.add(name)
+    counts = Counter(f"{c.sequence.category}/{c.sequence.name}" for c in captures)
+    (name, count), *_ = counts.most_common(1) or [("", 0)]
+    if count > 1:
+        raise InputError(f"two captures are called {name}; rename one's folder")
 
 
 def _difference(frozen: Protocol, fresh: Protocol) -> str:
@@ -186,15 +185,14 @@ def device_of(table: TableConfig) -> str:
 
 def require_different(methods: Iterable[MethodConfig]) -> None:
     """InputError for two methods that are the same: one cell cannot be two rows."""
-    known: list[MethodConfig] = []
+    known: dict[str, MethodConfig] = {}
     for method in methods:
-        for other in known:
-            if (other.factory, other.options) == (method.factory, method.options):
-                raise InputError(
-                    f"methods {other.name} and {method.name} are the same, with the same options; "
-                    "leave one out: methods=[...]"
-                )
-        known.append(method)
+        other = known.setdefault(digest([method.factory, method.options]), method)
+        if other is not method:
+            raise InputError(
+                f"methods {other.name} and {method.name} are the same, with the same options; "
+                "leave one out: methods=[...]"
+            )
 
 
 @dataclass(frozen=True)
@@ -210,18 +208,17 @@ class OpenJobs:
 def open_jobs(jobs: list[CellJob], folder: TableFolder, say: Callable[[str], None]) -> OpenJobs:
     """Find what is finished and what only needs scoring; damaged cells are announced."""
     found = OpenJobs([], [], [])
-    rest: list[CellJob] = []
+    images: dict[str, Path] | None = None
     for job in jobs:
         cell = _sound_cell(job.folder, say)
-        is_done = cell is not None and cell.status == OK
-        (found.done if is_done else rest).append(job)
-    images = _cells_with_images(folder) if rest else {}
-    for job in rest:
-        there = images.get(identity_of(job.made_from))
-        if there is None:
-            found.to_make.append(job)
-        else:
+        if cell is not None and cell.status == OK:
+            found.done.append(job)
+            continue
+        images = _cells_with_images(folder) if images is None else images
+        if there := images.get(identity_of(job.made_from)):
             found.to_score.append(replace(job, images_from=there))
+        else:
+            found.to_make.append(job)
     return found
 
 
