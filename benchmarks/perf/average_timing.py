@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_avg_fn
 
 from benchmarks.perf.diffusion_case import configuration
-from benchmarks.perf.timing import Row, compare
+from benchmarks.perf.timing import Row, compare, devices
 from extrap_train.diffusion.averaging import AveragedModule
 from extrap_train.diffusion.model import ExtrapolationModel
 
@@ -23,8 +23,7 @@ _REPEATS = 5
 
 def run() -> list[Row]:
     """One row per device; on the CPU the seconds of a core, too."""
-    names = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
-    return [compare_averages(FULL_WIDTH, torch.device(name)) for name in names]
+    return [compare_averages(FULL_WIDTH, device) for device in devices()]
 
 
 def compare_averages(width: int, device: torch.device, repeats: int = _REPEATS) -> Row:

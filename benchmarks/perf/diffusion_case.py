@@ -1,8 +1,7 @@
 """The diffusion model that is timed: full size on a GPU, a slim one of the same make on a CPU."""
 
 import copy
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
 from itertools import product
 
 import torch
@@ -26,46 +25,38 @@ PEAK_TFLOPS = {"H200": 989, "H100": 989, "A100": 312, "A6000": 155, "4090": 165}
 
 
 Run = Callable[[], Float[Tensor, "..."]]
-_DEVICES = {"cpu": ("0.3 of the width", 96, (1, 4)), "cuda": ("full size", 320, (1, 4, 16, 32))}
+_MODELS = {"cpu": ("0.3 of the width", 96, (1, 4)), "cuda": ("full size", 320, (1, 4, 16, 32))}
 """Name of the model, channels of its finest level, and batch sizes; the paper trains with 4."""
 
 
-@dataclass(frozen=True)
-class Workload:
-    """What is timed on one kind of device."""
-
-    title: str
-    passes: int
-    """Forward passes per image that it costs as much as."""
-    repeats: int
-
-
 def compare_models(
-    workloads: Mapping[str, Workload],
+    device: torch.device,
+    title: str,
+    passes: int,
     ours: Callable[[ExtrapolationModel, PairBatch], Run],
     reference: Callable[[ExtrapolationModel, PairBatch], Run],
+    repeats: int,
 ) -> list[Row]:
-    """One row per device and batch size, on a GPU with torch.compile as well.
+    """One row per batch size, on a GPU with torch.compile as well.
 
-    Prints the speed and memory of both. `workloads` are by device type; `reference` is built with
-    the plain copy of the model.
+    Prints the speed and memory of both, each of which costs as much as so many forward `passes` an
+    image. `reference` is built with the plain copy of the model.
     """
     rows = []
-    for kind in ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",):
-        (name, width, counts), workload = _DEVICES[kind], workloads[kind]
-        device, config = torch.device(kind), configuration(width)
-        for count, compiled in product(counts, (False, True) if kind == "cuda" else (False,)):
-            model, batch = optimised(config, device), batch_of(count, device)
-            theirs = reference(plain(model), batch)
-            if compiled:
-                model.unet.compile()
-            mine = ours(model, batch)
-            case = f"{workload.title}, {name}, batch {count}{', compiled' if compiled else ''}"
-            row = compare(case, device, mine, theirs, workload.repeats)
-            flops = workload.passes * count * forward_flops(config)
-            print(f"{case}: {_describe(device, count, row.ours_ms, mine, flops)}")
-            print(f"  plain float32: {_describe(device, count, row.reference_ms, theirs, flops)}")
-            rows.append(row)
+    name, width, counts = _MODELS[device.type]
+    config, on_gpu = configuration(width), device.type == "cuda"
+    for count, compiled in product(counts, (False, True) if on_gpu else (False,)):
+        model, batch = optimised(config, device), batch_of(count, device)
+        theirs = reference(plain(model), batch)
+        if compiled:
+            model.unet.compile()
+        mine = ours(model, batch)
+        case = f"{title}, {name}, batch {count}{', compiled' if compiled else ''}"
+        row = compare(case, device, mine, theirs, repeats)
+        flops = passes * count * forward_flops(config)
+        print(f"{case}: {_describe(device, count, row.ours_ms, mine, flops)}")
+        print(f"  plain float32: {_describe(device, count, row.reference_ms, theirs, flops)}")
+        rows.append(row)
     return rows
 
 

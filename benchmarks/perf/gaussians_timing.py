@@ -6,13 +6,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks.perf.timing import Row, compare
+from benchmarks.perf.timing import Row, compare, devices
 from benchmarks.perf.warp_timing import orbit_camera
 from extrap_train.gaussians.density import rotation_matrices
 from extrap_train.gaussians.losses import photograph, photometric_loss
 from extrap_train.gaussians.projection import LOW_PASS, NEAR_PLANE
 from extrap_train.gaussians.projection_numba import MIN_ALPHA
-from extrap_train.gaussians.rasterize import Backend, rasterizer
+from extrap_train.gaussians.rasterize import rasterizer
 from extrap_train.geometry.cameras import pixel_grid
 from extrap_train.views import Camera
 
@@ -34,18 +34,16 @@ Draw = Callable[..., Float[Tensor, "h w 3"]]
 
 def run() -> list[Row]:
     """One row per number of Gaussians and image size; where there is a GPU, gsplat's, too."""
-    backends: list[Backend] = ["numba", "gsplat"] if torch.cuda.is_available() else ["numba"]
     rows = []
-    for backend in backends:
-        rows += [_compare(n, size, backend, _differentiate) for size in SIZES for n in COUNTS]
-        rows.append(_compare(COUNTS[0], SIZES[0], backend, _train))
+    for device in devices():
+        rows += [_compare(n, size, device, _differentiate) for size in SIZES for n in COUNTS]
+        rows.append(_compare(COUNTS[0], SIZES[0], device, _train))
     return rows
 
 
-def _compare(count: int, size: int, backend: Backend, job: Callable) -> Row:
-    device = torch.device("cuda" if backend == "gsplat" else "cpu")
+def _compare(count: int, size: int, device: torch.device, job: Callable) -> Row:
     camera = orbit_camera(0.0, size).to(device)
-    rasterize = rasterizer(backend)
+    rasterize = rasterizer("gsplat" if device.type == "cuda" else "numba")
 
     def ours(*inputs: Tensor) -> Float[Tensor, "h w 3"]:
         poses = (camera.world_to_cam[None], camera.intrinsics[None])

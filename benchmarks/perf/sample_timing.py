@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks.perf.diffusion_case import Run, Workload, compare_models
-from benchmarks.perf.timing import Row
+from benchmarks.perf.diffusion_case import Run, compare_models
+from benchmarks.perf.timing import Row, devices
 from extrap_train.config import SamplerConfig
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import ddim_timesteps, sample_ddim, sample_views, view_generator
@@ -15,10 +15,7 @@ from extrap_train.views import PairBatch
 
 _GUIDANCE = 3.0
 _STEPS = {"cpu": 2, "cuda": 50}
-_WORKLOADS = {
-    kind: Workload(f"{_STEPS[kind]} guided steps", 2 * _STEPS[kind], repeats)
-    for kind, repeats in (("cpu", 3), ("cuda", 5))
-}
+_REPEATS = {"cpu": 3, "cuda": 5}
 
 
 def run() -> list[Row]:
@@ -27,7 +24,12 @@ def run() -> list[Row]:
     On a GPU also with torch.compile, which the validations of a training with trainer.compile=true
     sample with, and no other task.
     """
-    return compare_models(_WORKLOADS, sampling, plain_sampling)
+    rows = []
+    for device in devices():
+        steps, repeats = _STEPS[device.type], _REPEATS[device.type]
+        title = f"{steps} guided steps"
+        rows += compare_models(device, title, 2 * steps, sampling, plain_sampling, repeats)
+    return rows
 
 
 def sampling(model: ExtrapolationModel, batch: PairBatch) -> Run:

@@ -28,6 +28,12 @@ class Row:
     max_abs_diff: float
 
 
+def devices() -> list[torch.device]:
+    """The CPU and, where there is one, the GPU."""
+    names = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
+    return [torch.device(name) for name in names]
+
+
 def compare(
     case: str,
     device: torch.device,

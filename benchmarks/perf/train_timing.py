@@ -8,27 +8,27 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks.perf.diffusion_case import Run, Workload, compare_models
-from benchmarks.perf.timing import Row
+from benchmarks.perf.diffusion_case import Run, compare_models
+from benchmarks.perf.timing import Row, devices
 from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.views import PairBatch
 
 _FORWARD_AND_BACKWARD = 3
 """Operations of a training step over those of a forward pass, by convention."""
-_WORKLOADS = {
-    kind: Workload("step", _FORWARD_AND_BACKWARD, repeats)
-    for kind, repeats in (("cpu", 3), ("cuda", 15))
-}
+_REPEATS = {"cpu": 3, "cuda": 15}
 
 
 def run() -> list[Row]:
     """One row per device and batch size, on a GPU also with torch.compile."""
-    return compare_models(
-        _WORKLOADS,
-        partial(training_step, optimised=True),
-        partial(training_step, optimised=False),
-    )
+    ours, plain = (partial(training_step, optimised=is_ours) for is_ours in (True, False))
+    return [
+        row
+        for device in devices()
+        for row in compare_models(
+            device, "step", _FORWARD_AND_BACKWARD, ours, plain, _REPEATS[device.type]
+        )
+    ]
 
 
 def training_step(model: ExtrapolationModel, batch: PairBatch, *, optimised: bool) -> Run:

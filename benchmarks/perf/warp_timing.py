@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks.perf.timing import Row, compare
+from benchmarks.perf.timing import Row, compare, devices
 from extrap_train.geometry.cameras import unproject_to_world
 from extrap_train.geometry.visibility import Ball, Visibility, trace_torch, trace_visibility
 from extrap_train.geometry.warp import splat_points
@@ -26,8 +26,7 @@ QUERY_ANGLE_DEG = 15.0
 
 def run() -> list[Row]:
     """Rows for every image size; on the GPU, too, where there is one."""
-    names = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
-    rows = [_compare_splats(size, torch.device(name)) for name in names for size in SIZES]
+    rows = [_compare_splats(size, device) for device in devices() for size in SIZES]
     return [*rows, *(_compare_visibility(size) for size in VISIBILITY_SIZES)]
 
 

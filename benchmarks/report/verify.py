@@ -13,7 +13,7 @@ from benchmarks.protocol.prepared_scene import Scene
 from benchmarks.report.aggregate import UNIT, Results, read_results
 from benchmarks.report.formats import tables
 from benchmarks.run.cells import OK, Cell, files_of, is_plan_unchanged
-from benchmarks.run.identity import cell_key, image_options, judged_columns, scores_manifest
+from benchmarks.run.identity import cell_key, image_options, scores_manifest
 from benchmarks.run.plan import TableFolder, selected_draws
 from benchmarks.score import Score
 from benchmarks.score.scoring import score_files
@@ -73,7 +73,7 @@ def _scoring_here(
     there = {net: file for net, file in scoring.lpips_weights.items() if Path(file).is_file()}
     here = replace(scoring, lpips_weights={**there, **lpips_weights})
     hashes, stated = scores_manifest(here).inputs, results.plan.scored_from.inputs
-    columns, unchecked = judged_columns(here), {}
+    columns, unchecked = here.judged, {}
     for column in filter(stated.__contains__, columns):
         if column not in hashes:
             option = f"give scoring.{column.replace('lpips_', 'lpips_weights.')}=FILE"

@@ -56,6 +56,11 @@ def making_code(module: str = "") -> str:
     return sources_digest(_MAKING, module)
 
 
+def preparing_code() -> str:
+    """Digest of the code that prepares scenes."""
+    return sources_digest(_PREPARING)
+
+
 def images_manifest(
     config: MethodConfig,
     scene: Scene,
@@ -84,22 +89,12 @@ def scores_manifest(scoring: ScoringConfig) -> Manifest:
     return Manifest.of(options, files | code | {"code": sources_digest(_SCORING)})
 
 
-def scene_origin(*content: object) -> str:
-    """Digest of what decides a prepared scene, and of the code that prepares it."""
-    return digest([sources_digest(_PREPARING), *content])
-
-
-def judged_columns(scoring: ScoringConfig) -> list[str]:
-    """The columns that a network judges."""
-    return [*(f"lpips_{net}" for net in scoring.lpips), *(["dists"] if scoring.dists else [])]
-
-
 def judging_files(scoring: ScoringConfig) -> Mapping[str, Path]:
     """By column, the file that judges: the one that is named, there or not, or else the one in
     torch's hub cache. A column without either is left out.
     """
     files = {}
-    for column in judged_columns(scoring):
+    for column in scoring.judged:
         net = column.removeprefix("lpips_")
         cached = hub_cache() / BACKBONES["vgg" if column == "dists" else net]
         if net in scoring.lpips_weights:

@@ -16,7 +16,7 @@ from benchmarks.run.identity import (
     cell_key,
     identity_of,
     images_manifest,
-    scene_origin,
+    preparing_code,
     scores_manifest,
 )
 from benchmarks.run.method_content import MethodContent
@@ -135,9 +135,10 @@ def prepare_draws(
     """Every draw's folder, one after another, made where it is missing or of another origin."""
     by_name = {(c.sequence.category, c.sequence.name): c for c in captures}
     files = [path for path in weight_files(depth) if path.is_file()]
-    found_by = [asdict(depth), *map(file_digest, files)]
+    made_by = [preparing_code(), asdict(table.captures), asdict(table.rules)]
+    made_by += [asdict(depth), *map(file_digest, files)]
     for draw in draws:
-        origin = scene_origin(asdict(table.captures), asdict(table.rules), found_by, asdict(draw))
+        origin = digest([*made_by, asdict(draw)])
         capture = by_name[draw.category, draw.sequence]
         yield prepare_scene(folder.scene(draw), capture, draw, table.rules, depth, origin)
 

@@ -4,7 +4,7 @@ A metric without a value says why; no other network's number stands in for it.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -135,20 +135,28 @@ def _perceptual(
     images: Float[Tensor, "n 3 h w"], truth: Float[Tensor, "n 3 h w"], config: ScoringConfig
 ) -> dict[str, Score]:
     scores = {}
-    for name, load in _networks(config).items():
+    for column in config.judged:
         try:
-            scores[name] = _of_images(load()(images, truth), "")
+            scores[column] = _of_images(_network(column, config)(images, truth), "")
         except InputError as error:
-            scores[name] = Score(None, str(error))
+            scores[column] = Score(None, str(error))
     return scores
 
 
-def _networks(config: ScoringConfig) -> dict[str, Callable[[], Distance]]:
-    def lpips(net: str) -> Callable[[], Distance]:
-        return lambda: _lpips(net, config.lpips_weights.get(net))
+def missing_networks(config: ScoringConfig) -> dict[str, str]:
+    """The perceptual metrics that cannot be had here, each with its reason."""
+    reasons = {}
+    for column in config.judged:
+        try:
+            _network(column, config)
+        except InputError as error:
+            reasons[column] = str(error)
+    return reasons
 
-    networks: dict[str, Callable[[], Distance]] = {f"lpips_{n}": lpips(n) for n in config.lpips}
-    return networks | ({"dists": _dists} if config.dists else {})
+
+def _network(column: str, config: ScoringConfig) -> Distance:
+    net = column.removeprefix("lpips_")
+    return _dists() if column == "dists" else _lpips(net, config.lpips_weights.get(net))
 
 
 @lru_cache(3)
@@ -159,17 +167,6 @@ def _lpips(net: str, weights: str | None) -> Distance:
 @lru_cache(1)
 def _dists() -> Distance:
     return dists_distance()
-
-
-def missing_networks(config: ScoringConfig) -> dict[str, str]:
-    """The perceptual metrics that cannot be had here, each with its reason."""
-    reasons = {}
-    for name, load in _networks(config).items():
-        try:
-            load()
-        except InputError as error:
-            reasons[name] = str(error)
-    return reasons
 
 
 def megascenes_compat(images: Float[Tensor, "n 3 h w"], truth: Truth) -> dict[str, Score]:

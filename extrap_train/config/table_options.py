@@ -129,6 +129,11 @@ class ScoringConfig:
     )
     own: dict[str, MetricConfig] = option({}, "what these files say; not to be set")
 
+    @property
+    def judged(self) -> list[str]:
+        """The columns that a network judges."""
+        return [*(f"lpips_{net}" for net in self.lpips), *(["dists"] if self.dists else [])]
+
 
 @dataclass
 class QuickConfig:
