@@ -58,21 +58,34 @@ def test_other_judges_are_noted_row_by_row() -> None:
     pd.testing.assert_series_equal(found[list(expected)], pd.Series(expected), check_names=False)
 
 
-def _results(output: Path) -> Results:
-    return read_results(greys_folder(output))
-
-
-def test_compare_pairs_cells(own: Path, finished: Path, copy: Path) -> None:
-    same = compare(_results(finished), _results(copy))
-    assert (same[same["metric"] == "psnr"]["verdict"] == "the same").all()
-    run_greys(own, copy, "options.dark.level=0.45")
-    changed = compare(_results(finished), _results(copy)).set_index(["method", "metric"])
-    row = changed.loc[("dark", "psnr")]
+def test_compare_pairs_cells() -> None:
+    one = [cell("dark", "a", 0, 20.0), cell("dark", "b", 0, 22.0), cell("light", "a", 0, 18.0)]
+    other = [cell("dark", "b", 0, 25.0), cell("light", "a", 0, 18.0), cell("dark", "a", 0, 21.0)]
+    rows = compare(results(*one), results(*other)).set_index(["method", "metric"])
+    row = rows.loc[("dark", "psnr")]
     assert row["verdict"] == "too few captures to tell"
     assert row["captures"] == 2
-    assert row["difference"] == pytest.approx(row["after"] - row["before"])
-    assert changed.loc[("light", "psnr")]["verdict"] == "the same"
-    assert (changed["scoring"] == "same").all()
+    assert (row["before"], row["after"], row["difference"]) == pytest.approx((21, 23, 2))
+    assert rows.loc[("light", "psnr")]["verdict"] == "the same"
+    assert (rows["scoring"] == "same").all()
+
+
+def test_compare_keeps_draws_apart() -> None:
+    cells = [replace(cell("a", "x", 0, 20.0), draw=draw) for draw in ("random", "spread")]
+    rows = compare(results(*cells), results(*cells)).query("metric == 'psnr'")
+    assert list(rows["draw"]) == ["random", "spread"]
+    assert list(rows["captures"]) == [1, 1]
+
+
+def test_compare_refuses_other_photographs() -> None:
+    one = cell("a", "x", 0, 20.0)
+    other = replace(one, made_from=replace(one.made_from, inputs={"photographs": "of others"}))
+    with pytest.raises(InputError, match=r"different photographs or cameras of cup-x-3-random"):
+        compare(results(one), results(other))
+
+
+def _results(output: Path) -> Results:
+    return read_results(greys_folder(output))
 
 
 def test_compare_notes_another_scoring(
@@ -87,21 +100,6 @@ def test_compare_notes_another_scoring(
     assert "note: where scoring is `other`" in capsys.readouterr().err
     assert main(["compare", str(copy / "greys"), str(copy / "greys")]) == 0
     assert not capsys.readouterr().err
-
-
-def test_compare_keeps_draws_apart_and_refuses_other_photographs(
-    own: Path, finished: Path, copy: Path, tmp_path: Path
-) -> None:
-    draws = "draws=[random,spread]"
-    assert run_greys(own, copy, draws, quick=True) == 0
-    same = compare(_results(copy), _results(copy)).query("metric == 'psnr'")
-    assert list(same["draw"]) == ["random", "random", "spread", "spread"]
-    assert list(same["captures"]) == [1, 1, 1, 1]
-    assert run_greys(own, tmp_path / "other", "captures.render_size=32", quick=True) == 0
-    with pytest.raises(
-        InputError, match=r"different photographs or cameras of apple-0000-3-random"
-    ):
-        compare(_results(finished), _results(tmp_path / "other"))
 
 
 def test_compare_refuses_a_cell_that_does_not_say_what_it_was_made_from(copy: Path) -> None:

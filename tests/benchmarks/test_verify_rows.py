@@ -1,18 +1,38 @@
 """A row is what it is called: relabelled, dropped and damaged results are noticed."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from benchmarks.__main__ import main
+from benchmarks.protocol.prepared_scene import Scene
+from benchmarks.report import verify as verification
 from benchmarks.report.verify import verify
+from benchmarks.score import Score
 from extrap_train.errors import InputError
 from tests.benchmarks.tables import greys_folder
 
 Edit = Callable[[dict[str, Any]], Any]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _scored_once() -> Iterator[None]:
+    """Pictures stay as they are in these tests: so do their scores."""
+    known: dict[tuple[object, ...], dict[str, Score]] = {}
+    score_files = verification.score_files
+
+    def score(folder: Path, images: Any, points: Any, scene: Scene, scoring: Any) -> Any:
+        key = (*images.values(), *points.values(), scene.data_hash, repr(scoring))
+        if key not in known:
+            known[key] = score_files(folder, images, points, scene, scoring)
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("benchmarks.report.verify.score_files", score)
+        yield
 
 
 def _edit(file: Path, edit: Edit) -> None:
