@@ -245,7 +245,7 @@ def print_plan(
     which a column stays empty.
     """
     known = _seconds_of_cells(folder)
-    typical = known.groupby("method").median()
+    making, scoring = (known.groupby("method")[step].median() for step in ("making", "scoring"))
     shown = Table("method", "cells", "to make", "to score", "seconds a cell", "missing")
     total, unknown = 0.0, []
     for name in dict.fromkeys(job.method.name for job in jobs):
@@ -253,13 +253,13 @@ def print_plan(
             [job for job in part if job.method.name == name]
             for part in (jobs, left.to_make, left.to_score)
         )
-        make_s, score_s = typical.loc[name] if name in typical.index else (math.nan, math.nan)
-        score_s = known["scoring"].median() if math.isnan(score_s) else score_s
+        make_s, score_s = (float(step.get(name, math.nan)) for step in (making, scoring))
+        score_s = float(known["scoring"].median()) if math.isnan(score_s) else score_s
         if (to_make and math.isnan(make_s)) or (to_score and math.isnan(score_s)):
             unknown.append(name)
-        seconds = np.nan_to_num([make_s, score_s])
-        total += seconds @ [len(to_make), len(to_make) + len(to_score)]
-        rate = "not yet known" if math.isnan(make_s) else f"{seconds.sum():.1f}"
+        per_cell = np.nan_to_num([make_s, score_s])
+        total += float(per_cell @ [len(to_make), len(to_make) + len(to_score)])
+        rate = "not yet known" if math.isnan(make_s) else f"{per_cell.sum():.1f}"
         weights = mine[0].made_from.inputs["weights"]
         missing = weights.partition(MISSING_WEIGHTS)[2]
         shown.add_row(name, *(str(len(part)) for part in (mine, to_make, to_score)), rate, missing)
