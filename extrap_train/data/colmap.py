@@ -17,9 +17,9 @@ import torch
 
 from extrap_train.data.camera_check import COLMAP_POSES
 from extrap_train.data.image_files import MAX_PIXELS
+from extrap_train.data.listed_files import ListedFiles
 from extrap_train.data.listed_photographs import (
     Listed,
-    ListedFiles,
     ListedPhotograph,
     sequence_of_photographs,
 )

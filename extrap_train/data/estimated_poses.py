@@ -23,7 +23,7 @@ from PIL import Image
 from extrap_train.data.camera_check import LONGEST_FOCAL, SHORTEST_FOCAL
 from extrap_train.data.colmap import read_model, read_model_cameras
 from extrap_train.data.image_files import read_photograph, to_eight_bits, upright_photograph
-from extrap_train.data.listed_photographs import PICTURE_SUFFIXES
+from extrap_train.data.listed_files import PICTURE_SUFFIXES, is_mask_name
 from extrap_train.data.paths import require_file
 from extrap_train.data.sequences import FrameSequence
 from extrap_train.data.structure_from_motion import (
@@ -53,12 +53,13 @@ log = logging.getLogger(__name__)
 
 
 def find_pictures(folder: Path) -> list[str]:
-    """The names of the pictures in a folder, which need not exist, in order."""
+    """The names of the photographs in a folder, which need not exist, in order; not of masks."""
     if not folder.is_dir():
         return []
     paths = (path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES)
     files = (path for path in paths if path.is_file() or path.is_symlink())  # broken ones are named
-    return sorted(path.name for path in files if not path.name.startswith("."))
+    names = sorted(path.name for path in files if not path.name.startswith("."))
+    return [name for name in names if not is_mask_name(name, names)]
 
 
 def read_unposed(folder: Path, pictures: Sequence[str], name: str) -> FrameSequence:

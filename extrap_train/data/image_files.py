@@ -6,12 +6,13 @@ way its camera holds it.
 
 import functools
 import io
+import itertools
 import logging
 import math
 import operator
 import struct
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -87,14 +88,28 @@ def read_photograph(
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> Float[Tensor, "h w"]:
-    """An object mask in [0, 1]; one without any object is an error.
+    """An object mask in [0, 1]: white is the object, or of a cut-out what is not transparent.
 
     A mask of the same shape as `size` is resampled to it. One of 0 and 1 alone means black and
-    white.
+    white. One without any object is an error, one that is all object a warning for each folder.
     """
-    pixels = read_grey(path, size)
+    picture = read_picture(path, size, _EIGHT_BIT_MODES)
+    pixels = np.array(picture.convert("L"))
+    if picture.has_transparency_data:
+        alpha = np.array(picture.convert("RGBA").getchannel("A"))
+        pixels = alpha if alpha.min() < 255 else pixels
+    pixels = nearest_pixels(pixels, size)
     if not pixels.any():
-        raise InputError(f"{path}: the mask is black everywhere; remove it or its frame")
+        raise InputError(
+            f"{path}: the mask selects nothing (black is background); correct or remove it, or "
+            "remove its frame"
+        )
+    if pixels.min() == pixels.max() and next(_full_masks(path.parent)) == 0:
+        log.warning(
+            "%s: the mask selects the whole picture, and so may others of its folder; correct or "
+            "remove them",
+            path,
+        )
     return torch.from_numpy(pixels).float().div_(1 if pixels.max() == 1 else 255)
 
 
@@ -128,9 +143,11 @@ def read_picture(
         as_stored = fits(stored, size) and not (upright and as_turned)
         if not (as_stored or as_turned):
             turns = f", turned by its EXIF orientation {_text(turned)}," if turned != stored else ""
+            other = "photograph has" if resize else "annotation says"
             raise InputError(
-                f"{path}: is {_text(stored)} pixels (height x width){turns} but its annotation "
-                f"says {_text(size)}; restore the file or correct the annotation"
+                f"{path}: is {_text(stored)} pixels (height x width){turns} but its {other} "
+                f"{_text(size)}{', another shape' if resize else ''}; restore the file or correct "
+                "its entry"
             )
         if tag != 1 and as_stored and as_turned:
             _warn_of_orientation(path.parent)
@@ -295,6 +312,12 @@ def _on_ground(picture: Image.Image, grey: int) -> Image.Image:
     """The picture over grey where it is transparent."""
     ground = Image.new("RGBA", picture.size, (grey, grey, grey, 255))
     return Image.alpha_composite(ground, picture.convert("RGBA"))
+
+
+@functools.lru_cache(maxsize=1024)
+def _full_masks(folder: Path) -> Iterator[int]:
+    """Counts the masks of a folder that select everything."""
+    return itertools.count()
 
 
 @functools.lru_cache(maxsize=1024)

@@ -2,14 +2,9 @@
 they stand there to a sequence.
 """
 
-import difflib
 import logging
-import os
-import posixpath
-import unicodedata
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -20,81 +15,21 @@ from torch import Tensor
 from extrap_train.data.camera_check import PoseConvention, find_pose_fault, require_sound
 from extrap_train.data.depth_files import DepthFile
 from extrap_train.data.image_files import image_size, same_view
+from extrap_train.data.listed_files import (
+    PICTURE_SUFFIXES,
+    ListedFiles,
+    MaskFiles,
+    normal_path,
+)
 from extrap_train.data.sequences import NO_CATEGORY, FrameSequence, Photograph, PointCloud
 from extrap_train.errors import InputError
 from extrap_train.geometry.lens import Lens
 from extrap_train.views import Camera, stack_poses
 
-PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
-"""Tried, in this order, where a name has none."""
-_MOST_COMPARED = 2000
-"""Names of a folder that a missing one is compared with."""
 MAX_FRAMES = 100_000
 """Of a capture; more are no capture of one scene."""
 
 log = logging.getLogger(__name__)
-
-
-class ListedFiles:
-    """The files below one folder, by the paths that a description gives them.
-
-    Paths have passed `check_relative`. A folder is listed once, and only where a file is missing.
-    """
-
-    def __init__(self, root: Path) -> None:
-        self.root = root
-        self._folders: dict[str, dict[str, list[str]]] = {}
-
-    def find(self, listed: str, suffixes: Sequence[str] = ()) -> str | None:
-        """The path below the root that `listed` means, None where there is no such file.
-
-        Tried in turn: the path itself; `\\` as a stroke; with one of the `suffixes` added; and each
-        of these in another case or Unicode form, where only one file is called so.
-        """
-        spellings = [listed, listed.replace("\\", "/")] if "\\" in listed else [listed]
-        candidates = [
-            posixpath.normpath(spelling) + suffix
-            for spelling in spellings
-            for suffix in ("", *suffixes)
-        ]
-        if _is_file(self.root / candidates[0]):
-            return candidates[0]
-        alike = [(posixpath.split(path), self._alike(path)) for path in candidates]
-        exact = [posixpath.join(*path) for path, names in alike if path[1] in names]
-        other = [posixpath.join(path[0], names[0]) for path, names in alike if len(names) == 1]
-        there = (path for path in (*exact, *other) if _is_file(self.root / path))
-        return next(there, None)
-
-    def explain(self, listed: str) -> str:
-        """What is there instead of a file that was not found."""
-        path = _normal(listed)
-        if os.path.lexists(self.root / path):
-            return f"{path} is no regular file"
-        folder, name = posixpath.split(path)
-        looked_in = {folder: None, "": None, "images": None}
-        for place in looked_in:
-            alike = _look_alike(name, self._in(place).values())
-            if alike is not None:
-                return f"there is no {path}; there is {posixpath.join(place, alike)}"
-        if folder and not (self.root / folder).is_dir():
-            return f"there is no folder {folder}"
-        return f"there is no {path}"
-
-    def _alike(self, path: str) -> list[str]:
-        """The names in the path's folder that are its own but for case and Unicode form."""
-        folder, name = posixpath.split(path)
-        return self._in(folder).get(_folded(name), [])
-
-    def _in(self, folder: str) -> dict[str, list[str]]:
-        """The names in a folder, by their folded form."""
-        if folder not in self._folders:
-            names = self._folders.setdefault(folder, {})
-            try:
-                for path in sorted((self.root / folder).iterdir()):
-                    names.setdefault(_folded(path.name), []).append(path.name)
-            except OSError:
-                pass  # nothing is in a folder that is not there
-        return self._folders[folder]
 
 
 @dataclass(frozen=True)
@@ -133,7 +68,8 @@ def sequence_of_photographs(
 ) -> FrameSequence:
     """A sequence of the photographs below `files.root`, in the order of their paths.
 
-    `description` is the file that lists them; `unusable` says of more of its entries why they name
+    `description` is the file that lists them; masks that it does not name are found by `MaskFiles`.
+    `unusable` says of more of its entries why they name
     no picture. Entries without a picture, and those that cannot be used or contradict each other,
     are left out with one warning each kind. Raises InputError where none is left, or the cameras
     can see nothing in common.
@@ -144,6 +80,7 @@ def sequence_of_photographs(
     pictures = _find_pictures(files, listed, description)
     names = _frame_names([_name_path(path, entries) for path, entries in pictures])
     frames, left_out, resized = [], [*unusable], []
+    masks = MaskFiles(files.root)
     for (path, entries), frame_name in zip(pictures, names, strict=True):
         if not entries:
             continue
@@ -156,7 +93,7 @@ def sequence_of_photographs(
                     name=frame_name,
                     camera=pinhole_camera(photo, description),
                     image_path=photo.image_path,
-                    mask_path=photo.mask_path,
+                    mask=files.root / photo.mask_path if photo.mask_path else masks.find(path),
                     depth=photo.depth,
                     lens=None if photo.lens.is_pinhole else photo.lens,
                     upright=photo.upright,
@@ -169,6 +106,7 @@ def sequence_of_photographs(
             resized.append(f"{path} has {photo.height} x {photo.width} pixels (height x width)")
     if not frames:
         raise InputError(left_out[0])
+    masks.warn_of_missing()
     if left_out:
         log.warning("%d of %d frames are left out: %s", len(left_out), count, left_out[0])
     if resized:
@@ -199,7 +137,7 @@ def _find_pictures(
         path = files.find(entry.path, PICTURE_SUFFIXES)
         if path is None:
             missing.append(entry.path)
-            entries.setdefault(_normal(entry.path), [])
+            entries.setdefault(normal_path(entry.path), [])
         else:
             entries.setdefault(path, []).append(entry)
     found = [path for path, same in entries.items() if same]
@@ -232,12 +170,8 @@ def _describe(path: str, entries: Sequence[Listed], description: Path) -> Listed
 
 def _name_path(path: str, entries: Sequence[Listed]) -> str:
     """The path that a frame is named by: its file's, but for case, which the description's has."""
-    listed = _normal(entries[0].path) if entries else path
+    listed = normal_path(entries[0].path) if entries else path
     return listed if listed.casefold() == path.casefold() else path
-
-
-def _normal(listed: str) -> str:
-    return posixpath.normpath(listed.replace("\\", "/"))
 
 
 def _frame_names(paths: Sequence[str]) -> list[str]:
@@ -288,24 +222,3 @@ def _camera(photo: ListedPhotograph, pinhole: Lens) -> Camera:
         photo.height,
         photo.width,
     )
-
-
-def _folded(name: str) -> str:
-    """The same for names that differ in case or in how accents are composed."""
-    return unicodedata.normalize("NFC", name).casefold()
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError:  # longer than any path
-        return False
-
-
-def _look_alike(name: str, names: Iterable[Sequence[str]]) -> str | None:
-    """A name of the same stem, else one that differs in little."""
-    few = [other for alike in islice(names, _MOST_COMPARED) for other in alike]
-    stem = posixpath.splitext(name)[0].casefold()
-    same = [other for other in few if posixpath.splitext(other)[0].casefold() == stem]
-    near = same or difflib.get_close_matches(name, few, n=1, cutoff=0.8)
-    return near[0] if near else None

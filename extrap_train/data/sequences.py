@@ -56,7 +56,7 @@ class Photograph:
     camera: Camera
     """Of the undistorted photograph."""
     image_path: str
-    mask_path: str | None = None
+    mask: Path | None = None
     depth: DepthFile | None = None
     lens: Lens | None = None
     """To be undone; None for a pinhole camera's photograph."""
@@ -69,21 +69,21 @@ class Photograph:
         parts.append(f"depth in {self.depth.scale if self.depth else None}")
         parts += ["upright"] if self.upright else []
         depth = (self.depth.path, self.depth.mask_path) if self.depth else ()
+        files = self.image_path, self.mask, *depth
         return Frame(
             name=self.name,
             camera=self.camera,
             has_depth=self.depth is not None,
-            has_mask=self.mask_path is not None,
+            has_mask=self.mask is not None,
             load=self.load,
-            files=tuple(self.root / p for p in (self.image_path, self.mask_path, *depth) if p),
+            files=tuple(self.root / file for file in files if file),
             reading=", ".join(parts),
         )
 
     def load(self, *, depth: bool = True) -> View:
         """See `Load`."""
         size = self.camera.height, self.camera.width
-        mask_path = self.root / self.mask_path if self.mask_path else None
-        image, mask = read_photograph(self.root / self.image_path, size, mask_path, self.upright)
+        image, mask = read_photograph(self.root / self.image_path, size, self.mask, self.upright)
         found = self.depth.read(self.root, size) if depth and self.depth else None
         return View(
             image=self._straighten(image.permute(1, 2, 0)).permute(2, 0, 1).contiguous(),

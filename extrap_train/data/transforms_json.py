@@ -14,9 +14,9 @@ from extrap_train.data.depth_files import DepthFile
 from extrap_train.data.image_files import MAX_PIXELS, image_size
 from extrap_train.data.json_files import read_json, require_dict, require_list
 from extrap_train.data.lens_keys import LENS_KEYS, lens_of, merge_entry, number_of
+from extrap_train.data.listed_files import ListedFiles
 from extrap_train.data.listed_photographs import (
     Listed,
-    ListedFiles,
     ListedPhotograph,
     pinhole_camera,
     sequence_of_photographs,

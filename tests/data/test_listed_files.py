@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from extrap_train.data.listed_photographs import PICTURE_SUFFIXES, ListedFiles
+from extrap_train.data.listed_files import PICTURE_SUFFIXES, ListedFiles
 
 
 @pytest.fixture

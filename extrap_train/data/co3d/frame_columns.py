@@ -119,7 +119,7 @@ class Co3dFrames(Sequence[Frame]):
             name=image.rpartition("/")[2],
             camera=camera,
             image_path=image,
-            mask_path=mask or None,
+            mask=self.root / mask if mask else None,
             depth=DepthFile(depth, scale, depth_mask or None, True) if depth else None,
         ).frame()
 
