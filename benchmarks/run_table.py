@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.catalogue import Catalogue
+from benchmarks.protocol.draws import write_sealed
 from benchmarks.protocol.prepared_scene import Scene, truths_removed
 from benchmarks.report.aggregate import read_results
 from benchmarks.run.cells import (
@@ -29,7 +30,6 @@ from benchmarks.run.cells import (
     failed_output,
     keep_output,
     score_cell,
-    write_plan,
 )
 from benchmarks.run.method_content import MISSING_WEIGHTS, is_ours, method_contents
 from benchmarks.run.plan import (
@@ -153,7 +153,7 @@ def _run(
             f"{kept} of {len(jobs)} cells are kept in {folder.path}; run the same command again "
             "to go on"
         ) from None
-    write_plan(folder.plan, plan)
+    write_sealed(folder.plan, plan)
     return _report(folder, catalogue, [*made, *scored], console)
 
 

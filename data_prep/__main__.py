@@ -1,30 +1,18 @@
 """`python -m data_prep`: sequences in, pair data set and report out."""
 
-from pathlib import Path
-
 from extrap_train.cli import PREP, command
 from extrap_train.config import DataPrepConfig
 
 
 def _run(config: DataPrepConfig) -> None:
     # Heavy imports wait until the options are known to be right.
-    from data_prep.category_pairs import check_members, prepare_category
+    from data_prep.category_pairs import prepare_members
     from data_prep.prep_report import write_report
     from extrap_train.terminal import terminal
 
-    check_members(config.category, config.data)
-    for member in config.category.members:
-        prepared = prepare_category(
-            member,
-            config.data,
-            config.depth,
-            config.prep,
-            output=Path(config.output),
-            workers=config.workers or config.threads,
-            matcher=config.matcher,
-            launcher=config.launcher,
-            retry=True,
-        )
+    workers = config.workers or config.threads
+    made = prepare_members(config, workers=workers, launcher=config.launcher, retry=True)
+    for prepared in made:
         write_report(prepared, terminal())
 
 

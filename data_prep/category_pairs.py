@@ -17,9 +17,9 @@ from data_prep.preparation import prepare
 from data_prep.sequence_job import pair_options
 from data_prep.synthesize import synthesize
 from extrap_train.config import (
-    CategoryConfig,
     Co3dConfig,
     DataConfig,
+    DataPrepConfig,
     DatasetDepthConfig,
     DepthConfig,
     LauncherConfig,
@@ -38,13 +38,6 @@ from extrap_train.jobs import Launcher
 from extrap_train.jobs.slurm import open_launcher
 
 LOCAL = LocalConfig()
-
-
-def check_members(category: CategoryConfig, data: DataConfig) -> None:
-    """InputError where a member is not there: before minutes go into those ahead of it."""
-    if isinstance(data, Co3dConfig) and data.root is not None:
-        for member in category.members:
-            require_category(Path(data.root), member)
 
 
 def prepare_category(
@@ -99,21 +92,38 @@ def prepare_category(
         )
 
 
-def prepare_for_training(config: TrainConfig) -> list[PreparedData]:
-    """The pairs of every member of the category, prepared now or before."""
-    check_members(config.category, config.data)
-    return [
-        prepare_category(
+def prepare_members(
+    config: TrainConfig | DataPrepConfig,
+    *,
+    workers: int | None,
+    launcher: LauncherConfig = LOCAL,
+    retry: bool = False,
+) -> Iterator[PreparedData]:
+    """The pairs of every member of the category, one after another, prepared now or before.
+
+    InputError where a member is not there, before minutes go into those ahead of it.
+    """
+    members, data = config.category.members, config.data
+    if isinstance(data, Co3dConfig) and data.root is not None:
+        for member in members:
+            require_category(Path(data.root), member)
+    for member in members:
+        yield prepare_category(
             member,
-            config.data,
+            data,
             config.depth,
             config.prep,
             output=Path(config.output),
-            workers=config.threads,
+            workers=workers,
             matcher=config.matcher,
+            launcher=launcher,
+            retry=retry,
         )
-        for member in config.category.members
-    ]
+
+
+def prepare_for_training(config: TrainConfig) -> list[PreparedData]:
+    """The pairs that a training needs; sequences that failed before are not tried again."""
+    return [*prepare_members(config, workers=config.threads)]
 
 
 def is_corrected(data: DataConfig, depth: DepthConfig, prep: PrepConfig) -> bool:

@@ -137,13 +137,13 @@ def _state(job: _Job) -> str:
     if not (job.folder / RECORD).exists():
         return "missing"
     record = _read_record(job.folder)
-    if (
-        record is None
-        or record.options != job.options
-        or len(record.frames) != job.options["frames"]
-    ):
-        return "outdated"
-    return "ready" if record.sequence.get("sequence_name") == job.name else "outdated"
+    is_ready = (
+        record is not None
+        and record.options == job.options
+        and len(record.frames) == job.options["frames"]
+        and record.sequence.get("sequence_name") == job.name
+    )
+    return "ready" if is_ready else "outdated"
 
 
 def _read_record(folder: Path) -> _Record | None:

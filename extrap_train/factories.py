@@ -55,15 +55,20 @@ def import_factory(factory: str, name: str) -> Any:
         ) from None
 
 
+def module_file(module: str) -> Path | None:
+    """Where a module lies, without importing it; None where there is none."""
+    try:
+        spec = importlib.util.find_spec(module)
+    except (ImportError, ValueError):
+        return None
+    return Path(spec.origin) if spec and spec.origin else None
+
+
 def files_of(factory: str, options: Mapping[str, Any]) -> list[Path]:
     """The module that `factory` lies in, and every file that an option names."""
-    try:
-        spec = importlib.util.find_spec(factory.rpartition(".")[0])
-    except (ImportError, ValueError):
-        spec = None
-    module = [Path(spec.origin)] if spec and spec.origin else []
+    module = module_file(factory.rpartition(".")[0])
     paths = [Path(value) for value in options.values() if isinstance(value, str) and value]
-    return module + [path for path in paths if path.is_file()]
+    return ([module] if module else []) + [path for path in paths if path.is_file()]
 
 
 def _typed_options(

@@ -3,9 +3,10 @@
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import torch
+from pydantic import Field
 
 from benchmarks.protocol.array_files import read_points
 from benchmarks.protocol.draws import Draw, Protocol, draw_sequence
@@ -20,7 +21,6 @@ from extrap_train.config import (
     SyntheticConfig,
 )
 from extrap_train.data.co3d import read_category
-from extrap_train.data.json_files import read_json, require_list
 from extrap_train.data.scene_spec import SYNTHETIC_SCHEME, open_scene
 from extrap_train.data.sequences import NO_CATEGORY, FrameSequence
 from extrap_train.data.synthetic import build_scene, surface_points
@@ -29,6 +29,7 @@ from extrap_train.data.transforms_json import TRANSFORMS, read_transforms
 from extrap_train.diffusion.leakage import Training, trainings_of
 from extrap_train.errors import InputError
 from extrap_train.store.manifest import Split
+from extrap_train.store.records import read_record
 from extrap_train.views import stack_poses
 
 CLOUD_POINTS = 20_000
@@ -201,45 +202,34 @@ def _reconfusion(config: CapturesConfig) -> list[FrameSequence]:
     return [replace(read_transforms(f), category="co3d", name=f.name) for f in folders]
 
 
+@dataclass(frozen=True)
+class _GivenSplit:
+    """`train_test_split_N.json`: places of frames among all that are listed, in order of names."""
+
+    train_ids: list[Annotated[int, Field(ge=0)]]
+    test_ids: list[Annotated[int, Field(ge=0)]]
+
+
 def _given_draws(config: CapturesConfig, capture: FrameSequence, rules: RulesConfig) -> list[Draw]:
-    """The split files' own choice, `{"train_ids": [...], "test_ids": [...]}`."""
+    """The split files' own choice of inputs and targets."""
     draws = []
+    listed, present = sorted(capture.listed), {frame.name for frame in capture.frames}
     for n_views in rules.views:
         file = Path(str(config.root)) / capture.name / f"train_test_split_{n_views}.json"
-        content = read_json(file)
-        try:
-            inputs, targets = (
-                _frames_of(capture, require_list(content[key], key, file))
-                for key in ("train_ids", "test_ids")
-            )
-        except (KeyError, IndexError, TypeError, ValueError) as error:
-            if isinstance(error, InputError):
-                raise
+        split = read_record(file, _GivenSplit, "get it again")
+        ids = [*split.train_ids, *split.test_ids]
+        if max(ids, default=0) >= len(listed) or len(set(ids)) < len(ids):
             raise InputError(
-                f"{file}: names no frames of {capture.name} ({error!r}); get it again"
-            ) from None
-        if set(inputs) & set(targets):
-            raise InputError(f"{file}: has frames in both train_ids and test_ids; get it again")
+                f"{file}: names a frame twice, or one beyond the {len(listed)} of {capture.name}; "
+                "get it again"
+            )
+        inputs, targets = (
+            tuple(listed[i] for i in part) for part in (split.train_ids, split.test_ids)
+        )
+        if missing := [name for name in (*inputs, *targets) if name not in present]:
+            raise InputError(f"{file}: {missing[0]} is missing or cannot be used; get it again")
         draws.append(Draw(capture.category, capture.name, n_views, "given", 0, inputs, targets))
     return draws
-
-
-def _frames_of(capture: FrameSequence, ids: list[Any]) -> tuple[str, ...]:
-    """The names of frames by their places among all that are listed, in the order of names.
-
-    ValueError where those cannot be meant, or where the frame has no picture.
-    """
-    listed, present = sorted(capture.listed), {frame.name for frame in capture.frames}
-    wrong = [i for i in ids if type(i) is not int or not 0 <= i < len(listed)]
-    if wrong:
-        raise ValueError(f"{wrong[0]!r} is no number from 0 to {len(listed) - 1}")
-    if len(set(ids)) < len(ids):
-        raise ValueError("a number stands twice")
-    names = tuple(listed[i] for i in ids)
-    missing = [name for name in names if name not in present]
-    if missing:
-        raise ValueError(f"{missing[0]} is missing or cannot be used")
-    return names
 
 
 def _named(spec: str, categories: list[str]) -> FrameSequence:

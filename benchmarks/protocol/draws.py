@@ -8,12 +8,13 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from extrap_train.config import RulesConfig
+from extrap_train.data.json_files import read_json
 from extrap_train.errors import InputError
 from extrap_train.geometry.viewpoints import (
     camera_centers,
@@ -21,10 +22,9 @@ from extrap_train.geometry.viewpoints import (
     pairwise_angles,
     scene_center,
 )
-from extrap_train.store.records import read_record, write_record
+from extrap_train.store.atomic import write_atomic
+from extrap_train.store.records import read_record
 from extrap_train.views import Camera
-
-FORMAT = 1
 
 
 @dataclass(frozen=True)
@@ -47,41 +47,40 @@ class Draw:
 
 @dataclass(frozen=True)
 class Protocol:
-    """The rules of a table and every draw made by them."""
+    """The rules of a table and every draw made by them, `protocol.json`."""
 
     rules: RulesConfig
     draws: tuple[Draw, ...]
+    format: Literal[1] = 1
 
     @property
     def sha256(self) -> str:
         """Of the whole content: every result carries it."""
-        return digest({"format": FORMAT, **asdict(self)})
-
-    def write(self, file: Path) -> None:
-        """Freeze into a file."""
-        write_record(file, ProtocolRecord(FORMAT, self.rules, [*self.draws], self.sha256))
+        return digest(asdict(self))
 
     @classmethod
     def read(cls, file: Path) -> "Protocol":
         """A frozen protocol; raises InputError where its content is not what its hash says."""
-        content = read_record(file, ProtocolRecord, "delete it with the results beside it")
-        protocol = cls(content.rules, tuple(content.draws))
-        if content.format != FORMAT or protocol.sha256 != content.sha256:
+        remedy = "delete it with the results beside it"
+        protocol = read_record(file, cls, remedy)
+        if not is_sealed(file):
             raise InputError(
-                f"{file}: its content is not what its hash {content.sha256[:12]!a} says; restore "
-                "the file, or delete it with the results beside it"
+                f"{file}: its content is not what its hash says; restore it, or {remedy}"
             )
         return protocol
 
 
-@dataclass(frozen=True)
-class ProtocolRecord:
-    """A frozen protocol, `protocol.json`."""
+def write_sealed(file: Path, record: object) -> None:
+    """Write a dataclass as `read_record` reads it, with the digest of its content."""
+    content: dict[str, Any] = asdict(record)  # type: ignore[call-overload]
+    content["sha256"] = digest(content)
+    write_atomic(file, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
 
-    format: int
-    rules: RulesConfig
-    draws: list[Draw]
-    sha256: str
+
+def is_sealed(file: Path) -> bool:
+    """Whether a file holds what `write_sealed` wrote; InputError where it is no JSON."""
+    content = read_json(file)
+    return bool(content.pop("sha256", None) == digest(content))
 
 
 def digest(content: Any) -> str:

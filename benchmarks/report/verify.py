@@ -8,11 +8,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-from benchmarks.protocol.draws import Draw, Protocol
+from benchmarks.protocol.draws import Draw, Protocol, is_sealed
 from benchmarks.protocol.prepared_scene import Scene
 from benchmarks.report.aggregate import UNIT, Results, read_results
 from benchmarks.report.formats import tables
-from benchmarks.run.cells import OK, Cell, files_of, is_plan_unchanged
+from benchmarks.run.cells import OK, Cell, files_of
 from benchmarks.run.identity import cell_key, image_options, scores_manifest
 from benchmarks.run.plan import TableFolder, selected_draws
 from benchmarks.score import Score
@@ -97,7 +97,7 @@ def _protocol_problems(results: Results, made: Sequence[tuple[str, Draw]]) -> It
         yield str(error)
         return
     file, table = results.folder.plan, results.plan.table
-    if not is_plan_unchanged(file):
+    if not is_sealed(file):
         yield f"{file}: was changed after the run, as in its titles; run the table again"
     if protocol.sha256 != results.plan.protocol:
         yield f"{results.folder.protocol}: is not the protocol that the results carry"

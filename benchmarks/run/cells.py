@@ -11,9 +11,9 @@ entry is checked, and names in them lead to no other folder.
 import hashlib
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
 import torch
@@ -27,13 +27,12 @@ from benchmarks.protocol.array_files import (
     read_limited,
     sha256_of,
 )
-from benchmarks.protocol.draws import Draw, digest
+from benchmarks.protocol.draws import Draw
 from benchmarks.protocol.prepared_scene import Scene
 from benchmarks.score import Score
 from extrap_train.config import MethodConfig, ScoringConfig, TableConfig
 from extrap_train.config.options import MISSING
 from extrap_train.data.image_files import png_bytes
-from extrap_train.data.json_files import read_json
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import atomic_folder
 from extrap_train.store.manifest import Manifest
@@ -106,7 +105,10 @@ class Cell(MethodOutput):
 
 @dataclass(frozen=True)
 class Plan:
-    """What a table was when it was last run, `plan.json`: what reports and verification ask."""
+    """What a table was when it was last run, `plan.json`: what reports and verification ask.
+
+    The file is sealed (`write_sealed`), for what no cell states: titles, headings.
+    """
 
     table: TableConfig
     quick: bool
@@ -114,8 +116,6 @@ class Plan:
     scored_from: Manifest
     methods: dict[str, MethodConfig]
     cells: Annotated[list[FileName], AfterValidator(_all_different)]
-    sha256: str = ""
-    """Of everything else in the file (`write_plan`), for what no cell states: titles, headings."""
 
 
 def read_cell(folder: Path) -> Cell | None:
@@ -134,21 +134,6 @@ def read_cell(folder: Path) -> Cell | None:
         if sha256_of(folder / name) != stated:
             raise InputError(f"{folder / name}: is missing, or not what its cell's hash says")
     return cell
-
-
-def write_plan(file: Path, plan: Plan) -> None:
-    """Write what a table is, with the digest of it."""
-    write_record(file, replace(plan, sha256=_plan_digest(asdict(plan))))
-
-
-def is_plan_unchanged(file: Path) -> bool:
-    """Whether a plan's file holds what `write_plan` wrote; InputError where it is no JSON."""
-    content = read_json(file)
-    return bool(content.get("sha256") == _plan_digest(content))
-
-
-def _plan_digest(content: Mapping[str, Any]) -> str:
-    return digest({name: value for name, value in content.items() if name != "sha256"})
 
 
 def read_plan(file: Path) -> Plan:

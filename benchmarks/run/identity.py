@@ -5,7 +5,6 @@ checkout does not tell two edited ones apart. Reports have no part in it.
 """
 
 import hashlib
-import importlib.util
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
@@ -17,6 +16,7 @@ from benchmarks.protocol.prepared_scene import Scene
 from extrap_train.config import MethodConfig, RulesConfig, ScoringConfig
 from extrap_train.config.options import dotted
 from extrap_train.errors import InputError
+from extrap_train.factories import module_file
 from extrap_train.metrics import BACKBONES, hub_cache
 from extrap_train.store.digests import file_digest
 from extrap_train.store.manifest import Manifest
@@ -132,13 +132,10 @@ def _import_root(module: str) -> Path:
     """The folder on the import path that a module is found in, as `root` of root/package/module.py;
     of a module that belongs to an installed package its own file.
     """
-    try:
-        spec = importlib.util.find_spec(module)
-    except (ImportError, ValueError):
-        spec = None
-    if spec is None:
+    file = module_file(module)
+    if file is None:
         raise InputError(f"module {module}: not found; is its folder given with --config-dir?")
-    file = Path(str(spec.origin)).resolve()
+    file = file.resolve()
     if any(part in _NO_SOURCES for part in file.parts):
         return file
     return file.parents[module.count(".") + (file.name == "__init__.py")]

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.protocol.captures import Capture, freeze, open_captures, trained_models
-from benchmarks.protocol.draws import Draw, Protocol, digest
+from benchmarks.protocol.draws import Draw, Protocol, digest, write_sealed
 from benchmarks.protocol.prepared_scene import Scene, truths_of
 from benchmarks.protocol.scene_writing import prepare_scene
 from benchmarks.run.cells import OK, Cell, CellJob, read_cell
@@ -100,7 +100,7 @@ def open_protocol(
     _require_own_names(captures)
     fresh = freeze(table.captures, table.rules, captures)
     if not folder.protocol.is_file() or not any(folder.cells.glob("*/cell.json")):
-        fresh.write(folder.protocol)
+        write_sealed(folder.protocol, fresh)
         return fresh, captures
     frozen = Protocol.read(folder.protocol)
     if frozen != fresh:

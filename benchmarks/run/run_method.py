@@ -5,6 +5,8 @@ over as bytes, of which every entry is checked (`check_output`).
 import json
 import os
 import random
+import resource
+import sys
 import traceback
 from collections.abc import Mapping
 from dataclasses import replace
@@ -42,10 +44,6 @@ PER_IMAGE = "per image"
 """`MethodConfig.time` of the methods whose perform time is that of one image."""
 
 
-_STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-_RESET_PEAK = "5"
-
-
 def run_method(job: CellJob) -> bytes:
     """Run a method on what it may know of a scene; whatever it raises is its status and reason."""
     torch.set_num_threads(1)  # the same images, however many workers there are
@@ -53,13 +51,13 @@ def run_method(job: CellJob) -> bytes:
         os.environ["CUDA_VISIBLE_DEVICES"] = ""
     try:
         inputs = Scene.open(job.scene).inputs()
-        with PeakMemory() as memory, Stopwatch() as watch:
+        with Stopwatch() as watch:
             for seed in (random.seed, np.random.seed, torch.manual_seed):
                 seed(inputs.seed)
             method = build_method(job.method)
             weight_paths(method, inputs.category)  # what fails there is no sound method's
             synthesis = method.synthesize(inputs)
-        return _pack_synthesis(synthesis, inputs, job.method, watch.seconds, memory.mib)
+        return _pack_synthesis(synthesis, inputs, job.method, watch.seconds, peak_memory_mib())
     except Unavailable as error:
         return _pack({"status": UNAVAILABLE, "reason": one_line(str(error))})
     except BaseException as error:  # SystemExit and KeyboardInterrupt are its own, too
@@ -121,27 +119,17 @@ def _pack(values: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = N
     return safetensors.numpy.save({**contents, _RECORD: record})
 
 
-class PeakMemory:
-    """A `with` block's peak in MiB: of the GPU where there is one, else of the process.
+def peak_memory_mib() -> float | None:
+    """The most memory that this process has held, of the GPU where it sees one; None where the
+    system (no Linux) cannot say.
 
-    `mib` is None where the system (no Linux) cannot say.
+    Each method has a process of its own, which begins with what its server had imported.
     """
-
-    mib: float | None = None
-
-    def __enter__(self) -> "PeakMemory":
-        if torch.cuda.is_available():
-            torch.cuda.reset_peak_memory_stats()
-        elif _CLEAR.exists():
-            _CLEAR.write_text(_RESET_PEAK)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if torch.cuda.is_available():
-            self.mib = torch.cuda.max_memory_allocated() / 2**20
-        elif _STATUS.exists():
-            lines = dict(line.split(":", 1) for line in _STATUS.read_text().splitlines())
-            self.mib = float(lines["VmHWM"].split()[0]) / 1024
+    if torch.cuda.is_available():
+        return torch.cuda.max_memory_allocated() / 2**20
+    if sys.platform != "linux":
+        return None
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def _require_floats(values: Any, what: str) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.protocol.draws import Protocol, draw_sequence, farthest_frames
+from benchmarks.protocol.draws import Protocol, draw_sequence, farthest_frames, write_sealed
 from extrap_train.config import RulesConfig
 from extrap_train.errors import InputError
 from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
@@ -88,7 +88,7 @@ def test_too_few_frames_are_refused_by_name() -> None:
 def test_a_frozen_protocol_comes_back_and_its_hash_guards_it(tmp_path: Path) -> None:
     file = tmp_path / "protocol.json"
     protocol = Protocol(_RULES, tuple(_draws()))
-    protocol.write(file)
+    write_sealed(file, protocol)
     assert Protocol.read(file) == protocol
     assert Protocol.read(file).sha256 == protocol.sha256
     content = json.loads(file.read_text())

@@ -159,16 +159,16 @@ def test_corrupt_cells_are_announced_and_made_anew(
 def test_a_cell_of_the_cpu_sees_no_gpu_from_its_start(
     own: Path, copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Asking a GPU for its peak memory opens it, and hiding it afterwards changes nothing."""
+    """Asking a GPU for anything opens it, and hiding it afterwards changes nothing."""
     seen = []
 
-    class Watched(run_method.PeakMemory):
+    class Watched(run_method.Stopwatch):
         def __enter__(self) -> "Watched":
             seen.append(os.environ.get("CUDA_VISIBLE_DEVICES"))
             super().__enter__()
             return self
 
-    monkeypatch.setattr(run_method, "PeakMemory", Watched)
+    monkeypatch.setattr(run_method, "Stopwatch", Watched)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
     folder, catalogue = greys_folder(copy), Catalogue.with_own([str(own)])
     table = catalogue.table("greys", [f"output={copy}", "device=cpu"])
