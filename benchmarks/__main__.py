@@ -156,8 +156,11 @@ def _run(options: argparse.Namespace) -> int:
     table = catalogue.table(options.table, options.overrides)
     catalogue.check(table)  # before anything heavy loads
     from benchmarks.run_table import RunOptions, run_table
+    from extrap_train.jobs.slurm import slurm_launcher
 
-    run = RunOptions(options.quick, options.dry_run, options.workers, options.slurm)
+    logs = Path(table.output) / table.name / "slurm"
+    cluster = slurm_launcher(table.slurm, logs) if options.slurm else None
+    run = RunOptions(options.quick, options.dry_run, options.workers, cluster)
     failed = run_table(table, catalogue, run)
     if failed:
         print(f"{failed} cells have failed; the same command tries them again", file=sys.stderr)

@@ -50,7 +50,6 @@ from extrap_train.errors import InputError
 from extrap_train.jobs import Died, Launcher
 from extrap_train.jobs.isolated import IsolatedJob, IsolatedLauncher
 from extrap_train.jobs.local import LocalLauncher
-from extrap_train.jobs.slurm import slurm_launcher
 from extrap_train.store.atomic import file_lock, remove_leftovers
 from extrap_train.store.records import read_record
 from extrap_train.terminal import progress, terminal
@@ -68,9 +67,8 @@ class RunOptions:
     dry_run: bool = False
     workers: int = 0
     """Processes; 0 takes every core, or one on a GPU."""
-    slurm: bool = False
     launcher: Launcher | None = None
-    """In place of the above."""
+    """Where cells are made and scored, in place of processes here."""
 
 
 def run_table(table: TableConfig, catalogue: Catalogue, options: RunOptions) -> int:
@@ -139,7 +137,7 @@ def _run(
         cells=[job.folder.name for job in jobs],
     )
     try:
-        with _launchers(isolated, options, table, jobs, folder) as (making, scoring):
+        with _launchers(isolated, options.launcher, len(jobs)) as (making, scoring):
             made = _make(left.to_make, making, folder)
             images = [
                 replace(job, images_from=job.folder)
@@ -221,20 +219,15 @@ def _isolated_launcher(
 
 @contextmanager
 def _launchers(
-    isolated: IsolatedLauncher,
-    options: RunOptions,
-    table: TableConfig,
-    jobs: Sequence[CellJob],
-    folder: TableFolder,
+    isolated: IsolatedLauncher, elsewhere: Launcher | None, cells: int
 ) -> Iterator[tuple[Making, Launcher]]:
     """What makes images, each cell's in a process of its own, and what scores them."""
-    if options.launcher is not None or options.slurm:
-        elsewhere = options.launcher or slurm_launcher(table.slurm, folder.path / "slurm")
+    if elsewhere is not None:
         alone = IsolatedJob(run_method, isolated.timeout_s, isolated.preload)
         yield partial(elsewhere.run, alone), elsewhere
         return
     # A further process loads for as long as it takes to score some cells here.
-    with LocalLauncher(min(isolated.workers, 1 + len(jobs) // _CELLS_PER_SCORER)) as local:
+    with LocalLauncher(min(isolated.workers, 1 + cells // _CELLS_PER_SCORER)) as local:
         yield partial(isolated.run, run_method), local
 
 

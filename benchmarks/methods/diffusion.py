@@ -140,18 +140,13 @@ class Diffusion:
         except InputError as error:
             if is_repository(name):
                 raise Unavailable(str(error)) from None
+            is_ours = self.family == "ours"
+            recipe = f"category={category}" if is_ours else f"experiment=small_{self.family}"
             raise Unavailable(
                 f"no weights: {name} is neither a model folder nor in the package; train them with "
-                f"`{self._recipe(category)}` and give the run's model/ folder as "
+                f"`python -m extrap_train {recipe}` and give the run's model/ folder as "
                 f"options.METHOD.weights=FOLDER"
             ) from None
-
-    def _recipe(self, category: str) -> str:
-        """The command that makes the missing weights at the small size."""
-        chosen = (
-            f"category={category}" if self.family == "ours" else f"experiment=small_{self.family}"
-        )
-        return f"python -m extrap_train {chosen}"
 
 
 def target_names(inputs: SceneInputs) -> list[str]:

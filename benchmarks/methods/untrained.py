@@ -32,8 +32,9 @@ class NearestPhoto:
     def synthesize(self, inputs: SceneInputs) -> Synthesis:
         """The nearest input's image for every target."""
         with Stopwatch() as watch:
-            chosen = [inputs.views[row[0]].image for row in nearest_inputs(inputs, 1)]
-            images = torch.stack(chosen)
+            cameras = stack_cameras([view.camera for view in inputs.views])
+            nearest = references_by_nearness(cameras, inputs.targets)[:, 0]
+            images = torch.stack([inputs.views[index].image for index in nearest])
         return Synthesis(
             images,
             watch.seconds / len(images),
@@ -60,10 +61,3 @@ class InpaintedWarp:
             assert batch.warp is not None
             images = inpainted_warp(batch.warp).clamp(0, 1)
         return Synthesis(images, watch.seconds / len(images), photographs_used(views))
-
-
-def nearest_inputs(inputs: SceneInputs, count: int) -> list[list[int]]:
-    """For every target the up to `count` nearest inputs, nearest first."""
-    cameras = stack_cameras([view.camera for view in inputs.views])
-    order: list[list[int]] = references_by_nearness(cameras, inputs.targets)[:, :count].tolist()
-    return order

@@ -12,7 +12,7 @@ from typing import Any
 
 import pandas as pd
 from jaxtyping import Float
-from jinja2 import Environment
+from jinja2 import Environment, Template
 from PIL import Image
 from torch import Tensor
 
@@ -102,11 +102,12 @@ def latex(layout: Layout) -> str:
 
 def _render(name: str, layout: Layout, special: dict[str, str], **delimiters: Any) -> str:
     """The template with every value escaped."""
-    environment = Environment(
-        trim_blocks=True, lstrip_blocks=True, finalize=partial(_escape, special), **delimiters
-    )
-    template = environment.from_string((files("benchmarks.report") / name).read_text("utf-8"))
-    return template.render(layout=layout)
+    return _template(name, finalize=partial(_escape, special), **delimiters).render(layout=layout)
+
+
+def _template(name: str, **options: Any) -> Template:
+    environment = Environment(trim_blocks=True, lstrip_blocks=True, **options)
+    return environment.from_string((files("benchmarks.report") / name).read_text("utf-8"))
 
 
 def _escape(special: dict[str, str], value: object) -> str:
@@ -119,18 +120,10 @@ _LARGE_PIXELS = 160
 
 def page(results: Results, layout: Layout, plots: dict[str, str]) -> str:
     """The page as text."""
-    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    template = environment.from_string(
-        (files("benchmarks.report") / "page.html").read_text("utf-8")
-    )
     # No "</script" or "<!--" may stand in the element that holds the data.
     data = json.dumps(_scenes(results)).replace("<", "\\u003c")
-    return template.render(
-        layout=layout,
-        plots=plots,
-        data=data,
-        title=layout.title,
-        count=len(results.cells),
+    return _template("page.html", autoescape=True).render(
+        layout=layout, plots=plots, data=data, title=layout.title, count=len(results.cells)
     )
 
 
