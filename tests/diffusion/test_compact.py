@@ -1,6 +1,7 @@
 """Four bits a weight: how near they come, that such a folder loads, and what is refused."""
 
 import json
+import shutil
 import tracemalloc
 import zlib
 from collections.abc import Callable
@@ -11,7 +12,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from extrap_train.config import ModelConfig
+from extrap_train.config import ModelConfig, UNetConfig
 from extrap_train.diffusion import model_files
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.model_files import (
@@ -24,11 +25,24 @@ from extrap_train.diffusion.packaged import dequantised, quantised
 from extrap_train.errors import InputError
 
 
-@pytest.fixture
-def base(config: ModelConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A tiny packaged model, and a package that holds nothing else."""
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny base, and a model that was trained from it and packed."""
+    folder = tmp_path_factory.mktemp("saved")
+    unet = UNetConfig(channels=[16, 32], attention_levels=[False, True], heads=2, token_width=16)
     torch.manual_seed(0)
-    save_model(ExtrapolationModel(config), tmp_path / "base", torch.float16)
+    model = ExtrapolationModel(ModelConfig(name="tiny", image_size=32, octaves=2, unet=unet))
+    save_model(model, folder / "base", torch.float16)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(model_files, "packaged_weights", lambda name, option="": folder / name)
+        save_compact(_trained(folder / "base"), folder / "packed")
+    return folder
+
+
+@pytest.fixture
+def base(saved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A tiny packaged model, and a package that holds nothing else."""
+    shutil.copytree(saved / "base", tmp_path / "base")
 
     def packaged(name: str, option: str = "") -> Path:
         assert name == "base"
@@ -36,6 +50,12 @@ def base(config: ModelConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(model_files, "packaged_weights", packaged)
     return tmp_path / "base"
+
+
+@pytest.fixture
+def packed(base: Path, saved: Path, tmp_path: Path) -> Path:
+    """A model that was trained from the base, as its difference to that."""
+    return Path(shutil.copytree(saved / "packed", tmp_path / "packed"))
 
 
 def _trained(base: Path, **changes: object) -> ExtrapolationModel:
@@ -90,38 +110,35 @@ def test_another_family_keeps_its_own_first_layer_whole(base: Path, tmp_path: Pa
     )
 
 
-def test_training_starts_from_a_packed_model(base: Path, tmp_path: Path) -> None:
-    save_compact(_trained(base), tmp_path / "packed")
-    loaded = load_model(tmp_path / "packed")
-    started = initial_model(replace(loaded.config, start=str(tmp_path / "packed")))
+def test_training_starts_from_a_packed_model(packed: Path) -> None:
+    loaded = load_model(packed)
+    started = initial_model(replace(loaded.config, start=str(packed)))
     assert torch.equal(started.unet.conv_out.weight, loaded.unet.conv_out.weight)
 
 
-def test_a_difference_to_another_base_is_refused(base: Path, tmp_path: Path) -> None:
-    save_compact(_trained(base), tmp_path / "packed")
+def test_a_difference_to_another_base_is_refused(base: Path, packed: Path) -> None:
     save_model(_trained(base), base, torch.float16)
     with pytest.raises(InputError, match="difference to another base"):
-        load_model(tmp_path / "packed")
+        load_model(packed)
 
 
-def test_a_damaged_or_shortened_file_is_refused(base: Path, tmp_path: Path) -> None:
-    save_compact(_trained(base), tmp_path / "packed")
-    path = tmp_path / "packed" / "difference.safetensors"
+def test_a_damaged_or_shortened_file_is_refused(packed: Path) -> None:
+    path = packed / "difference.safetensors"
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match="cut off, damaged"):
-        load_model(tmp_path / "packed")
+        load_model(packed)
     middle = len(whole) * 2 // 3
     path.write_bytes(whole[:middle] + bytes(8) + whole[middle + 8 :])
     with pytest.raises(InputError, match="is damaged"):
-        load_model(tmp_path / "packed")
+        load_model(packed)
     path.write_bytes(whole)
     about = json.loads(whole[8 : 8 + int.from_bytes(whole[:8], "little")])["__metadata__"]
     tensors = load_file(path)
     del tensors["unet.conv_out.weight:bits"]
     save_file(tensors, path, about)
     with pytest.raises(InputError, match=r"1 missing \(conv_out\.weight\)"):
-        load_model(tmp_path / "packed")
+        load_model(packed)
 
 
 _NAME = "unet.conv_out.weight"
@@ -132,7 +149,7 @@ def _deflated(count: int) -> torch.Tensor:
 
 
 def _sizes(base: Path) -> tuple[int, int]:
-    weight = load_model(base).unet.conv_out.weight
+    weight = load_file(base / "unet" / "diffusion_pytorch_model.safetensors")["conv_out.weight"]
     return len(weight), -(-weight[0].numel() // 2)
 
 
@@ -152,24 +169,22 @@ def _sizes(base: Path) -> tuple[int, int]:
     ],
 )
 def test_what_is_no_difference_to_the_base_is_refused(
-    base: Path, tmp_path: Path, change: Callable, said: str
+    base: Path, packed: Path, change: Callable, said: str
 ) -> None:
-    save_compact(_trained(base), tmp_path / "packed")
-    _rewrite(tmp_path / "packed" / "difference.safetensors", _NAME, change(*_sizes(base)))
+    _rewrite(packed / "difference.safetensors", _NAME, change(*_sizes(base)))
     tracemalloc.start()
     with pytest.raises(InputError, match=said) as raised:
-        load_model(tmp_path / "packed")
+        load_model(packed)
     assert tracemalloc.get_traced_memory()[1] < 50e6, "bytes that the shape has no place for"
     tracemalloc.stop()
     assert "\n" not in str(raised.value)
 
 
-def test_a_difference_without_the_first_layer_is_refused(base: Path, tmp_path: Path) -> None:
-    save_compact(_trained(base), tmp_path / "packed")
-    file = tmp_path / "packed" / "difference.safetensors"
+def test_a_difference_without_the_first_layer_is_refused(packed: Path) -> None:
+    file = packed / "difference.safetensors"
     _rewrite(file, "unet.conv_in.weight", {":bits": None, ":scale": None})
     with pytest.raises(InputError, match="no convolution conv_in"):
-        load_model(tmp_path / "packed")
+        load_model(packed)
 
 
 def _rewrite(file: Path, name: str, changed: dict[str, torch.Tensor | None]) -> None:

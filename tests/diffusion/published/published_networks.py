@@ -20,14 +20,15 @@ TINY_UNET = UNetConfig(
 )
 
 TINY_MODEL = [
-    "prep.image_size=512",
+    "model.image_size=128",
+    "prep.image_size=256",
     "model.unet.channels=[32,64,128,128]",
     "model.vae.channels=[32,64,128,128]",
     "model.clip.width=128",
     "model.clip.layers=2",
     "model.clip.heads=2",
 ]
-"""The same size on the command line."""
+"""The same networks on the command line, for smaller views."""
 
 
 @dataclass(frozen=True)

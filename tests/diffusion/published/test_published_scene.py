@@ -38,7 +38,7 @@ def command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
 def test_it_generates(command, reference: Reference, checkpoint: Path, tmp_path: Path) -> None:
     command(reference.family, checkpoint, "task=view", "inputs=3", "pose=frame000003")
     folder = tmp_path / "view" / "hydrant-0000"
-    assert Image.open(folder / "views" / "frame000003.png").size == (256, 256)
+    assert Image.open(folder / "views" / "frame000003.png").size == (128, 128)
 
 
 def test_a_plain_diffusers_folder_generates(

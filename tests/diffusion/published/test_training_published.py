@@ -16,7 +16,7 @@ import pytest
 import torch
 from published_networks import TINY_MODEL, Reference, configured, tiny_config
 
-from benchmarks.perf.diffusion_case import batch_of
+from benchmarks.perf import diffusion_case
 from extrap_train.__main__ import main
 from extrap_train.config import ModelConfig, SamplerConfig, TrainConfig, TrainerConfig
 from extrap_train.diffusion.loss import diffusion_loss
@@ -34,7 +34,9 @@ def _trains(config: ModelConfig, folder: Path, *, mixed: bool) -> None:
     options = TrainerConfig(warmup_steps=0, ema_decay=0.0)
     training = CategoryTraining(model, TrainConfig(model=config, trainer=options), [], None)
     optimizer = training.configure_optimizers()["optimizer"]
-    batch = batch_of(1, torch.device("cpu"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(diffusion_case, "IMAGE_SIZE", config.image_size)
+        batch = diffusion_case.batch_of(1, torch.device("cpu"))
     frozen = [model.parts()[part] for part in ("vae", "image_encoder")]
     sums = {name: _sums(x) for name, x in model.named_parameters()}
     frozen_sums = [_sums(x) for network in frozen for x in network.parameters()]
@@ -57,7 +59,7 @@ def _trains(config: ModelConfig, folder: Path, *, mixed: bool) -> None:
     assert torch.equal(again.unet.conv_in.weight, trained)
     options_of_sampling = SamplerConfig(steps=2, guidance=3.0)
     image = sample_views(again, batch, options_of_sampling, ["view"])
-    assert image.shape == (1, 3, 256, 256)
+    assert image.shape == batch.image.shape
     assert image.isfinite().all()
 
 
@@ -68,7 +70,8 @@ def _sums(tensor: torch.Tensor) -> tuple[float, float]:
 
 def test_a_tiny_one(references: dict[str, Reference], tmp_path: Path) -> None:
     torch.save({"state_dict": references["zeronvs"].state}, tmp_path / "zeronvs.ckpt")
-    _trains(tiny_config("zeronvs", start=str(tmp_path / "zeronvs.ckpt")), tmp_path, mixed=False)
+    start = str(tmp_path / "zeronvs.ckpt")
+    _trains(tiny_config("zeronvs", image_size=128, start=start), tmp_path, mixed=False)
 
 
 @pytest.mark.slow
