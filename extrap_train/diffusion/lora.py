@@ -1,7 +1,7 @@
 """A scene's adapter: low-rank additions to a denoiser's layers, saved apart from its weights."""
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import peft
 import torch
 from pydantic import Field
-from torch import Tensor, nn
+from torch import Tensor
 
 from extrap_train.config import LoraConfig
 from extrap_train.diffusion.model import ExtrapolationModel
@@ -44,19 +44,11 @@ class AdapterOrigin:
 
 
 @dataclass(frozen=True)
-class BaseHashes:
-    """SHA-256 of the weights that an adapter belongs to."""
-
-    denoiser: str
-    others: str
-    """Of the networks that tell the denoiser what to generate."""
-
-
-@dataclass(frozen=True)
 class AdapterRecord(AdapterOrigin):
     """`base.json` in an adapter's folder."""
 
-    base: BaseHashes
+    base: str
+    """SHA-256 of the weights that the adapter belongs to."""
     tensors: str
     """SHA-256 of the file of the adapter's own tensors."""
 
@@ -109,7 +101,7 @@ def save_adapter(
     adapter.peft_config["default"].save_pretrained(str(folder))
     tensors = file_digest(folder / _WEIGHTS)
     write_record(
-        folder / _BASE, AdapterRecord(**vars(origin), base=base_hashes(model), tensors=tensors)
+        folder / _BASE, AdapterRecord(**vars(origin), base=base_hash(model), tensors=tensors)
     )
 
 
@@ -130,7 +122,7 @@ def load_adapter(model: ExtrapolationModel, folder: Path) -> peft.PeftModel:
     record = read_adapter_record(folder)
     options = read_record(folder / _OPTIONS, _SavedOptions, remedy)
     weights = _read_tensors(folder / _WEIGHTS, record.tensors, remedy)
-    if base_hashes(model) != record.base:
+    if base_hash(model) != record.base:
         raise InputError(
             f"adapter={folder}: was trained on other weights than these; give the weights= it was "
             "made for, or adapt these with task=scene"
@@ -162,19 +154,13 @@ def _read_tensors(file: Path, sha256: str, remedy: str) -> dict[str, Tensor]:
     return tensors
 
 
-def base_hashes(model: ExtrapolationModel) -> BaseHashes:
+def base_hash(model: ExtrapolationModel) -> str:
     """SHA-256 of a model's own weights, whether or not an adapter lies on them.
 
-    Of the denoiser, and of the networks whose outputs an adapter has learnt to read.
+    Also of the networks whose outputs an adapter has learnt to read.
     """
-    parts = model.parts()
-    others = [parts[name] for name in sorted(parts) if name != "unet"]
-    return BaseHashes(_hash([parts["unet"]]), _hash(others))
-
-
-def _hash(networks: Iterable[nn.Module]) -> str:
     digest = hashlib.sha256()
-    for network in networks:
+    for _, network in sorted(model.parts().items()):
         for name, value in sorted(network.state_dict().items()):
             if ".lora_" not in name:
                 digest.update(name.replace(".base_layer", "").encode())

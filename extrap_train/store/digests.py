@@ -2,26 +2,19 @@
 
 import hashlib
 import os
+import re
 import time
 from collections.abc import Iterator, Set
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 from extrap_train.errors import InputError
-from extrap_train.store.records import read_record, write_record
+from extrap_train.store.atomic import write_atomic
 
 _LARGE_BYTES = 64 * 2**20
 """Larger files are worth a record: below, hashing takes less than a tenth of a second."""
 _SETTLED_NS = 2 * 10**9
 """A file that changed more recently may change again within one tick of its clock."""
-
-
-@dataclass(frozen=True)
-class _Known:
-    path: str
-    stamp: list[int]
-    sha256: str
 
 
 def file_digest(path: Path) -> str:
@@ -36,15 +29,15 @@ def file_digest(path: Path) -> str:
         stamp = _stamp(path)
         if stamp[0] < _LARGE_BYTES:
             return _hashed(path)
-        name = hashlib.sha256(os.fsencode(path.resolve())).hexdigest()
-        record = cache_folder("digests") / f"{name}.json"
-        known = _read_known(record)
-        if known is not None and (known.path, known.stamp) == (str(path.resolve()), stamp):
-            return known.sha256
+        name = hashlib.sha256(f"{path.resolve()}\0{stamp}".encode(errors="surrogateescape"))
+        record = cache_folder("digests") / name.hexdigest()
+        if (known := _read_known(record)) is not None:
+            return known
         digest = _hashed(path)
         settled = time.time_ns() - max(stamp[1:3]) > _SETTLED_NS
         if settled and _stamp(path) == stamp:
-            _keep(record, _Known(str(path.resolve()), stamp, digest))
+            with suppress(InputError):  # a full or read-only home costs only time
+                write_atomic(record, digest.encode())
         return digest
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
@@ -98,13 +91,10 @@ def cache_folder(kind: str) -> Path:
     return Path(given or Path.home() / ".cache") / "extrap-train" / kind
 
 
-def _read_known(record: Path) -> _Known | None:
+def _read_known(record: Path) -> str | None:
+    """None where there is none yet, or it is damaged: the file itself says."""
     try:
-        return read_record(record, _Known, "")
-    except InputError:
-        return None  # none yet, or damaged: the file itself says
-
-
-def _keep(record: Path, known: _Known) -> None:
-    with suppress(InputError):  # a full or read-only home costs only time
-        write_record(record, known)
+        known = record.read_text()
+    except (OSError, ValueError):
+        return None
+    return known if re.fullmatch("[0-9a-f]{64}", known) else None

@@ -14,7 +14,7 @@ from extrap_train.config import LoraConfig, ModelConfig, SamplerConfig
 from extrap_train.diffusion.lora import (
     AdapterOrigin,
     add_adapter,
-    base_hashes,
+    base_hash,
     load_adapter,
     read_adapter_record,
     save_adapter,
@@ -109,7 +109,7 @@ def test_an_adapter_says_what_it_was_made_from(config: ModelConfig, tmp_path: Pa
     save_adapter(model, _randomised(model), folder, ORIGIN)
     record = read_adapter_record(folder)
     assert vars(ORIGIN).items() <= vars(record).items()
-    assert record.base == base_hashes(model)
+    assert record.base == base_hash(model)
 
 
 @pytest.mark.parametrize("changed", ["flip", "cut", "gone", "folder"])

@@ -51,13 +51,13 @@ def test_a_file_that_changed_is_read_again_even_with_its_old_time_and_size(
     assert file_digest(file) == _sha(b"six")
 
 
-@pytest.mark.parametrize("damage", [b"", b"[" * 20_000, b'{"path": 3}'])
+@pytest.mark.parametrize("damage", [b"", b"\xff" * 64, b"0" * 63])
 def test_a_damaged_record_costs_only_time(kept: Path, tmp_path: Path, damage: bytes) -> None:
     file = tmp_path / "weights"
     file.write_bytes(b"one")
     file_digest(file)
-    for record in kept.rglob("*.json"):
-        record.write_bytes(damage)
+    (record,) = (path for path in kept.rglob("*") if path.is_file())
+    record.write_bytes(damage)
     assert file_digest(file) == _sha(b"one")
 
 
