@@ -1,6 +1,5 @@
 """Figures that go with the numbers: contact sheets, curves and films."""
 
-import io
 import itertools
 import re
 import shutil
@@ -13,12 +12,13 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from matplotlib import font_manager
+from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from extrap_train.data.image_files import png_bytes, to_eight_bits
 from extrap_train.errors import InputError
-from extrap_train.store.atomic import partial_path, replace_synced, write_atomic
+from extrap_train.store.atomic import atomic_file, partial_path, replace_synced, write_atomic
 
 _HOLE_COLOUR = (1.0, 0.0, 1.0)
 _LEAST_TILE_PIXELS = 128
@@ -105,10 +105,14 @@ def curve(steps: list[int], series: dict[str, list[float]], label: str, path: Pa
     axes.set_xlabel("training steps")
     axes.set_ylabel(label)
     axes.legend()
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=100)
+    save_figure(figure, path)
+
+
+def save_figure(figure: Figure, path: Path, dpi: int = 100) -> None:
+    """Write matplotlib's figure as PNG, and close it."""
+    with atomic_file(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=dpi)
     plt.close(figure)
-    write_atomic(path, content.getvalue())
 
 
 def save_picture(image: Float[Tensor, "3 h w"], path: Path) -> None:

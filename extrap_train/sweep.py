@@ -6,7 +6,6 @@ that a sweep that is killed has the rows of what it finished, and a job that fai
 another: Hydra goes on with the others and ends with that job's error. A folder holds one sweep.
 """
 
-import io
 import math
 import sys
 import time
@@ -221,6 +220,8 @@ def draw(rows: pd.DataFrame, file: Path) -> None:
         return
     from matplotlib.figure import Figure  # a second that a single run need not wait
 
+    from extrap_train.figures import save_figure
+
     labels = _labels(done).where(lambda label: label != "", "job " + done["job"])
     figure = Figure(
         figsize=(7, 0.6 + len(metrics) * (0.5 + 0.25 * len(done))), layout="constrained"
@@ -233,9 +234,7 @@ def draw(rows: pd.DataFrame, file: Path) -> None:
         axes.invert_yaxis()
         axes.set_title(metric, fontsize=9)
         axes.bar_label(axes.containers[0], fmt="%.3g", fontsize=8)
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=120)
-    write_atomic(file, content.getvalue())
+    save_figure(figure, file, dpi=120)
 
 
 def compare_over_seeds(rows: pd.DataFrame, file: Path) -> None:

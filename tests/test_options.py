@@ -27,7 +27,7 @@ def test_every_option_says_what_it_means() -> None:
 def test_every_number_has_a_range_that_its_default_lies_in() -> None:
     numbers = [found for found in _all_options() if found.kind in (int, float)]
     assert len(numbers) > 60
-    assert [found.name for found in numbers if not found.has_range] == []
+    assert [found.name for found in numbers if not found.range] == []
     for found in numbers:
         found.check([] if found.default is None else found.default)
 

@@ -14,7 +14,7 @@ from extrap_train.config.model_options import (
 from extrap_train.config.options import check_options, packaged_names
 from extrap_train.errors import InputError
 
-_MAX_LEVELS, _MAX_WIDTH = 8, 8192
+_MAX_LEVELS = 8
 _MAX_LATENTS, _MAX_WARP = 256, 4096
 """Sides of the latents and of the warp: beyond them a view takes tens of gigabytes."""
 _PUBLISHED_STEPS = tuple(n for n in range(2, 501) if 1000 % n == 0)
@@ -146,11 +146,8 @@ def _check_network(model: ModelConfig) -> None:
         ("unet", model.unet.channels),
         ("vae", model.vae.channels if model.vae else []),
     ):
-        if len(channels) > _MAX_LEVELS or max(channels, default=0) > _MAX_WIDTH:
-            raise InputError(
-                f"model.{part}.channels: need at most {_MAX_LEVELS} levels of at most "
-                f"{_MAX_WIDTH} channels"
-            )
+        if len(channels) > _MAX_LEVELS:
+            raise InputError(f"model.{part}.channels: need at most {_MAX_LEVELS} levels")
     factor = model.patch if model.vae is None else 2 ** (len(model.vae.channels) - 1)
     if model.image_size > _MAX_LATENTS * factor or model.warp_size > _MAX_WARP:
         raise InputError(

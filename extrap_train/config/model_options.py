@@ -19,7 +19,7 @@ class UNetConfig:
         [32, 64, 128, 192],
         "width of each level, finest first; multiples of model.unet.norm_groups",
         low=1,
-        high=65_536,
+        high=8192,
     )
     layers_per_block: int = option(1, "residual layers per block", low=1, high=16)
     attention_levels: list[bool] = option(
@@ -35,7 +35,7 @@ class VaeConfig:
     """Shape of the latent space's autoencoder (diffusers' `AutoencoderKL`); Stable Diffusion's."""
 
     channels: list[int] = option(
-        [128, 256, 512, 512], "width of each level, finest first", low=1, high=65_536
+        [128, 256, 512, 512], "width of each level, finest first", low=1, high=8192
     )
     layers_per_block: int = option(2, "residual layers per block", low=1, high=16)
 

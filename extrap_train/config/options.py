@@ -54,11 +54,6 @@ class Option:
     """Of a mapping: whether its values are texts."""
 
     @property
-    def has_range(self) -> bool:
-        """Whether at least one end of it is declared."""
-        return math.isfinite(self.declared.low) or math.isfinite(self.declared.high)
-
-    @property
     def must_be(self) -> str:
         """What a value of it is."""
         if self.is_list:

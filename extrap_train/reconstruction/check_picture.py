@@ -1,6 +1,5 @@
 """One picture of what `capture_check` has found."""
 
-import io
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -8,11 +7,11 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 
+from extrap_train.figures import save_figure
 from extrap_train.geometry.epipolar import epipolar_lines, fundamental_matrix
 from extrap_train.geometry.viewpoints import camera_centers, fit_orbit
 from extrap_train.reconstruction.capture_check import CaptureCheck, MatchedViews
 from extrap_train.reconstruction.pose_check import FAR_PIXELS
-from extrap_train.store.atomic import write_atomic
 from extrap_train.views import View, stack_poses
 
 ROWS = 3
@@ -37,10 +36,7 @@ def draw_check(check: CaptureCheck, path: Path) -> None:
     _draw_distances(figure.add_subplot(grid[2, 3]), check)
     said = check.problems[:PROBLEMS] or ["nothing looks wrong"]
     figure.suptitle("\n".join(map(_shortened, said)), fontsize=11)
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=80)
-    plt.close(figure)
-    write_atomic(path, content.getvalue())
+    save_figure(figure, path, dpi=80)
 
 
 def _draw_row(axes: list[Axes], check: CaptureCheck, matched: MatchedViews, which: str) -> None:

@@ -1,6 +1,5 @@
 """Pictures of the cloud: how it grows view by view, and a turn around it (the paper's Fig. 3)."""
 
-import io
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,14 +10,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrap_train.figures import contact_sheet, film
+from extrap_train.figures import contact_sheet, film, save_figure
 from extrap_train.geometry.orbits import fit_circle
 from extrap_train.geometry.viewpoints import camera_centers, scene_center
 from extrap_train.geometry.warp import splat_points
 from extrap_train.reconstruction.cloud import PointCloud
 from extrap_train.reconstruction.global_map import GIVEN, GlobalMap
 from extrap_train.reconstruction.planner import Query, circle_cameras
-from extrap_train.store.atomic import write_atomic
 from extrap_train.views import Camera, stack_cameras
 
 PICTURE_SIZE = 192
@@ -97,10 +95,7 @@ def draw_plan(known: GlobalMap, queries: Sequence[Query], path: Path) -> None:
     axes.plot(0, 0, "k+")
     axes.set_aspect("equal")
     axes.legend()
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=100)
-    plt.close(figure)
-    write_atomic(path, content.getvalue())
+    save_figure(figure, path)
 
 
 def _turn(known: GlobalMap, count: int) -> Camera:
