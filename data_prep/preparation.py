@@ -110,7 +110,7 @@ def prepare(
         return PreparedData.open(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "manifest.json").unlink(missing_ok=True)
+        (folder / "preparation.json").unlink(missing_ok=True)
         outcomes, split = _make_all(plan, launcher, progress)
         for place in (folder, *context.frames_root.glob("*/*"), *context.pairs_root.glob("*/*")):
             remove_leftovers(place)
@@ -126,7 +126,7 @@ def prepare(
 
 def _is_finished(plan: _Plan, folder: Path, retry: bool) -> bool:
     """Whether an equal preparation is there and nothing that it stands on has been changed."""
-    if not (folder / "manifest.json").exists():
+    if not (folder / "preparation.json").exists():
         return False
     try:
         data = PreparedData.open(folder)

@@ -96,7 +96,7 @@ def write_results(
         "tables": {name: table_digest(folder / f"{name}.parquet") for name in TABLES},
         "versions": {name: package_version(name) for name in _PACKAGES},
     }
-    write_atomic(folder / "manifest.json", (json.dumps(manifest, indent=1) + "\n").encode())
+    write_atomic(folder / "preparation.json", (json.dumps(manifest, indent=1) + "\n").encode())
 
 
 def _frame_tables(jobs: list[SequenceJob], counts: Counter[str]) -> Iterator[pa.Table]:

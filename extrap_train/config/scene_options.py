@@ -46,9 +46,8 @@ class SceneOptions:
     input_frames: list[str] = option([], "names of the input views, instead of a number")
     weights: str | None = option(
         None,
-        "model folder, published checkpoint of the model= chosen, packaged model (base, "
-        "ours-hydrant) or repository of the Hugging Face hub (org/name, org/name@revision); null: "
-        "the category's latest run, or its packaged model",
+        "model folder, published checkpoint, packaged model (base) or repository of the hub "
+        "(org/name@revision); null: the category's latest run, or its packaged model",
     )
     adapter: str | None = option(
         None, "folder of a scene's adapter, as task=scene writes it, to apply to the weights"

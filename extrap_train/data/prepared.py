@@ -1,6 +1,6 @@
 """Prepared data on disk, as training reads it: pairs, cameras, and frames, decoded one by one.
 
-<folder>/manifest.json       what it was made from; written last: marks a finished preparation
+<folder>/preparation.json    what it was made from; written last: marks a finished preparation
          sequences.parquet   one row per sequence, dropped ones with their reason
          frames.parquet      one row per frame: name, camera, whether it may serve as a reference
          pairs.parquet       one row per ordered pair (reference → query)
@@ -63,7 +63,7 @@ class _SequenceCounts:
 
 @dataclass(frozen=True)
 class _Manifest:
-    """`manifest.json`, as `data_prep.tables` writes it."""
+    """`preparation.json`, as `data_prep.tables` writes it."""
 
     format: int
     key: str
@@ -152,7 +152,7 @@ class PreparedData:
     @classmethod
     def open(cls, folder: Path) -> "PreparedData":
         """Open a finished preparation; raises InputError where it is missing or damaged."""
-        manifest = read_manifest(folder)
+        manifest = read_preparation(folder)
         tables = {name: _read_table(folder, name, manifest) for name in TABLES}
         try:
             return cls(
@@ -253,9 +253,9 @@ class PreparedData:
         return PreparedData.open, (self.folder,)
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
+def read_preparation(folder: Path) -> dict[str, Any]:
     """What a folder was prepared from; raises InputError where that is missing or damaged."""
-    file = folder / "manifest.json"
+    file = folder / "preparation.json"
     if not file.is_file():
         raise InputError(f"{folder}: holds no finished preparation; run data_prep again")
     manifest = read_record(file, _Manifest, REMEDY)

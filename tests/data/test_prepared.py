@@ -151,7 +151,7 @@ def test_names_that_look_alike_as_files_stay_apart(tmp_path: Path) -> None:
     assert frames_folder(tmp_path, "cup/0003") == tmp_path / "frames" / "cup" / "0003"
 
 
-@pytest.mark.parametrize("name", ["manifest.json", "pairs.parquet", "frames.parquet"])
+@pytest.mark.parametrize("name", ["preparation.json", "pairs.parquet", "frames.parquet"])
 @pytest.mark.parametrize("content", [b"", b"garbage", b"{}"])
 def test_damage_is_one_line(folder: Path, name: str, content: bytes) -> None:
     file = folder / name
@@ -194,7 +194,7 @@ def test_a_table_that_was_changed_is_damage_and_is_not_parsed(folder: Path, chan
     ],
 )
 def test_a_manifest_of_other_types_or_sizes_is_damage(folder: Path, change: dict) -> None:
-    file = folder / "manifest.json"
+    file = folder / "preparation.json"
     whole = file.read_text()
     file.write_text(json.dumps(json.loads(whole) | change))
     try:
@@ -250,7 +250,7 @@ def test_an_unfinished_preparation_says_so(tmp_path: Path) -> None:
 
 
 def test_the_manifest_states_what_it_was_made_from(folder: Path) -> None:
-    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest = json.loads((folder / "preparation.json").read_text())
     assert manifest["options"]["image_size"] == SIZE
     assert manifest["depth"] == "DatasetDepth()"
     assert manifest["data"] == {"root": "a disk", "seed": 3}

@@ -106,7 +106,7 @@ def test_what_a_killed_run_has_half_written_is_removed(tmp_path: Path) -> None:
         half = tmp_path / "cup" / kind / "cup" / f".0001.{killed}.tmp"
         half.mkdir(parents=True)
         (half / "frames.npy").write_bytes(b"half of it")
-    (tmp_path / "cup" / f".manifest.json.{killed}.tmp").write_bytes(b"{")
+    (tmp_path / "cup" / f".preparation.json.{killed}.tmp").write_bytes(b"{")
     run(tmp_path / "cup", captures(3))
     assert not list((tmp_path / "cup").rglob("*.tmp"))
 

@@ -90,7 +90,7 @@ def test_damage_is_noticed_and_mended_by_the_same_command(
 def test_a_damaged_manifest_is_made_anew(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     sequences = [capture(ring(even(24)), name) for name in ("a", "b")]
     run(tmp_path, "cup", sequences, OPTIONS)
-    manifest = tmp_path / "cup" / "manifest.json"
+    manifest = tmp_path / "cup" / "preparation.json"
     whole = manifest.read_bytes()
     manifest.write_bytes(whole[:100])
     run(tmp_path, "cup", sequences, OPTIONS)
