@@ -78,6 +78,7 @@ def test_the_contract_of_files_is_kept(undisturbed: Path) -> None:
     names = {path.name for path in folder.iterdir()}
     expected = {
         "cloud.ply",
+        "mesh.ply",
         "splats.ply",
         "transforms.json",
         "colmap",

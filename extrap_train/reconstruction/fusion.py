@@ -45,7 +45,7 @@ def _fuse(view: MapView, known: GlobalMap) -> tuple[Float[Tensor, "h w"], Float[
     points = unproject_to_world(depths, stack_cameras([view.camera] * _SAMPLES)).flatten(0, 2)
     total, weights = torch.zeros_like(points[:, 0]), torch.zeros_like(points[:, 0])
     for index in known.nearest(view.camera, MOST_COMPARED):  # itself the first of them
-        distance, weight = _signed_distance(points, known.views[index])
+        distance, weight = signed_distance(points, known.views[index], _TRUNCATION)
         total += weight * distance
         weights += weight
     mean = (total / weights.clamp(min=1e-30)).view_as(depths)
@@ -55,8 +55,8 @@ def _fuse(view: MapView, known: GlobalMap) -> tuple[Float[Tensor, "h w"], Float[
     return depth, torch.where(found, view.confidence, 0)
 
 
-def _signed_distance(
-    points: Float[Tensor, "n 3"], view: MapView
+def signed_distance(
+    points: Float[Tensor, "n 3"], view: MapView, truncation: float
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
     """How far each point lies in front of the view's surface, in truncations and at most 1; and its
     weight, the view's confidence: 0 beyond one truncation behind the surface, which hides the rest.
@@ -67,7 +67,7 @@ def _signed_distance(
     inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     index = torch.where(inside, row * width + column, 0)
     surface, confidence = view.depth.flatten()[index], view.confidence.flatten()[index]
-    distance = (surface / z.clamp(min=1e-30) - 1) / _TRUNCATION
+    distance = (surface / z.clamp(min=1e-30) - 1) / truncation
     seen = inside & (surface > 0) & (distance > -1)
     return distance.clamp(max=1), torch.where(seen, confidence, 0)
 

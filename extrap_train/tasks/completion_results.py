@@ -25,6 +25,7 @@ from extrap_train.reconstruction.completion import CompletionPipeline, Step
 from extrap_train.reconstruction.export import write_cloud, write_colmap, write_views
 from extrap_train.reconstruction.global_map import GENERATED, GIVEN, GlobalMap, MapView
 from extrap_train.reconstruction.inputs import stand_where
+from extrap_train.reconstruction.mesh import write_mesh
 from extrap_train.reconstruction.planner import REFERENCES
 from extrap_train.reconstruction.prior import prior_of
 from extrap_train.reconstruction.report import (
@@ -43,6 +44,7 @@ from extrap_train.views import Camera, stack_cameras
 
 _NOTHING_SHARE = 0.02
 """Of the cloud's points: with fewer, the generated views added next to nothing."""
+_NO_MESH = "the views show no surface near the point that the cameras look at"
 SUBDIVIDE = 3
 """Points that a pixel of the cloud becomes along each axis."""
 
@@ -78,6 +80,7 @@ def write_completed(
     write_cloud(outside, folder / "cloud.ply")
     write_views(done.known, done.world, folder)
     write_colmap(done.known, done.world, outside, folder)
+    faces = write_mesh(done.known, done.world, cloud, folder / "mesh.ply")
     draw_growth(done.known, cloud, folder / "growth.png")
     draw_turntable(done.known, cloud, folder / "turntable.mp4")
     _draw_views(done.known, folder / "views.png")
@@ -96,10 +99,11 @@ def write_completed(
         "views": {kind: _count(done.known, kind) for kind in (GIVEN, GENERATED)},
         "points": len(cloud),
         "points_of_generated_views": int((cloud.view >= len(given)).sum()),
+        "mesh_faces": faces,
         "metrics": metrics,
         "held_out": held_out,
         "splats": splats,
-        "missing": missing | no_splats,
+        "missing": missing | no_splats | ({} if faces else {"mesh": _NO_MESH}),
         "loop": drift(done.steps, done.known),
         "consistency_db": view_consistency(done.known),
         "sphere_coverage": coverage_of(done.known),
