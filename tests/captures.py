@@ -1,7 +1,9 @@
 """A tiny capture with every kind of file, made for the readers' tests."""
 
+import copy
 import gzip
 import json
+from functools import cache
 from pathlib import Path
 
 import torch
@@ -14,6 +16,12 @@ SCENE = Scene((sphere(0.8), plane(0.9, (0.0, 1.0, 0.0))))
 
 
 def view_at(azimuth_deg: float, size: int = 32) -> View:
+    """A view from this side, each time another copy."""
+    return copy.deepcopy(_rendered(azimuth_deg, size))
+
+
+@cache
+def _rendered(azimuth_deg: float, size: int) -> View:
     camera = orbit_camera(azimuth_deg, size=size).cropped(0, 0, size, size + 8)
     depth = SCENE.depth(camera)
     # The horizon is further away than a file of millimetres can say.

@@ -97,6 +97,14 @@ def _compose_once() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _disk_need_not_keep_up() -> Iterator[None]:
+    """Files of tests need not survive a power cut: bringing each to the disk takes milliseconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda descriptor: None)
+        yield
+
+
 def _use_one_thread() -> None:
     import numba
     import torch

@@ -7,6 +7,7 @@ distances between cameras), and lie where depth files say (the unit of depth).
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 import torch
@@ -22,7 +23,8 @@ from extrap_train.reconstruction.pose_check import (
     FAR_PIXELS,
     LEAST_MATCHES,
     RATIO,
-    check_poses,
+    Pixels,
+    check_matches,
     small_view,
 )
 from extrap_train.views import View, stack_poses
@@ -93,19 +95,34 @@ def check_capture(views: Sequence[View]) -> CaptureCheck:
     cameras = stack_poses([view.camera for view in small])
     nearest = references_by_nearness(cameras, cameras)
     features = [detect_sift(view.image) for view in small]
+
+    @cache
+    def matches(first: int, second: int) -> Int[np.ndarray, "n 2"]:
+        if first > second:
+            return matches(second, first)[:, ::-1]
+        return match_mutual(descriptor_distance(features[first], features[second]), RATIO)
+
+    def matched_pixels(first: int, second: int) -> tuple[Pixels, Pixels]:
+        pairs = matches(first, second)
+        return features[first].pixels[pairs[:, 0]], features[second].pixels[pairs[:, 1]]
+
     matched = []
     for index, order in enumerate(nearest.tolist()):
         one, two = [other for other in order if other != index][:2]
-        pairs, others = (
-            match_mutual(descriptor_distance(features[index], features[k]), RATIO)
-            for k in (one, two)
-        )
-        pixels = features[index].pixels[pairs[:, 0]]
-        matches = features[one].pixels[pairs[:, 1]]
+        pairs, others = matches(index, one), matches(index, two)
+        pixels, nearest_pixels = matched_pixels(index, one)
+        third = features[two].pixels
         matched.append(
-            _measure(small, (index, one, two), pixels, matches, pairs, others, features[two].pixels)
+            _measure(small, (index, one, two), pixels, nearest_pixels, pairs, others, third)
         )
     check = CaptureCheck(small, matched)
+    try:
+        check_matches(
+            (small[i].camera, small[i + 1].camera, *matched_pixels(i, i + 1))
+            for i in range(len(small) - 1)
+        )
+    except InputError as error:
+        check.problems.append(str(error))
     check.problems.extend(_problems(check))
     return check
 
@@ -149,10 +166,6 @@ def _median(values: Float[np.ndarray, " n"], least: int = LEAST_MATCHES) -> floa
 
 
 def _problems(check: CaptureCheck) -> Iterator[str]:
-    try:
-        check_poses(check.views)
-    except InputError as error:
-        yield str(error)
     names = [view.name for view in check.views]
     lone = [names[m.views[0]] for m in check.matched if len(m.distances) < LEAST_MATCHES]
     if lone:

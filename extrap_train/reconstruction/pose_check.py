@@ -1,6 +1,6 @@
 """Poses in another axis convention, found by what the photographs' matches say of them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -13,6 +13,7 @@ from extrap_train.geometry.epipolar import epipolar_distance, fundamental_matrix
 from extrap_train.matching.sift import descriptor_distance, detect_sift, match_mutual
 from extrap_train.views import Camera, View
 
+Pixels = Float[np.ndarray, "n 2"]
 SIDE = 640
 """Photographs are matched at this many pixels a side, at most."""
 LEAST_MATCHES = 30
@@ -33,19 +34,26 @@ def check_poses(views: Sequence[View]) -> None:
 
     Too few matches say nothing, and poses that no convention mends are left to the depth source.
     """
-    given: list[float] = []
-    others: dict[str, list[float]] = {}
     small = [small_view(view) for view in views]
     described = [(view.camera, detect_sift(view.image)) for view in small]
-    for (one, features), (other, other_features) in pairwise(described):
-        pairs = match_mutual(descriptor_distance(features, other_features), RATIO)
-        if len(pairs) < LEAST_MATCHES:
+    matched = []
+    for (one, features), (other, others) in pairwise(described):
+        pairs = match_mutual(descriptor_distance(features, others), RATIO)
+        matched.append((one, other, features.pixels[pairs[:, 0]], others.pixels[pairs[:, 1]]))
+    check_matches(matched)
+
+
+def check_matches(matched: Iterable[tuple[Camera, Camera, Pixels, Pixels]]) -> None:
+    """`check_poses` of pairs of views whose pixels are matched."""
+    given: list[float] = []
+    others: dict[str, list[float]] = {}
+    for one, other, first, second in matched:
+        if len(first) < LEAST_MATCHES:
             continue
-        points = features.pixels[pairs[:, 0]], other_features.pixels[pairs[:, 1]]
-        given.append(_distance(*points, one, other))
+        given.append(_distance(first, second, one, other))
         others_of = _read_otherwise(other)
         for name, camera in _read_otherwise(one).items():
-            others.setdefault(name, []).append(_distance(*points, camera, others_of[name]))
+            others.setdefault(name, []).append(_distance(first, second, camera, others_of[name]))
     if not given or np.median(given) < FAR_PIXELS:
         return
     best = min(others, key=lambda name: float(np.median(others[name])))
@@ -75,8 +83,6 @@ def _read_otherwise(camera: Camera) -> dict[str, Camera]:
     return {name: replace(camera, world_to_cam=found) for name, found in matrices.items()}
 
 
-def _distance(
-    first: Float[np.ndarray, "n 2"], second: Float[np.ndarray, "n 2"], one: Camera, other: Camera
-) -> float:
+def _distance(first: Pixels, second: Pixels, one: Camera, other: Camera) -> float:
     """Median distance of the second points from the first ones' epipolar lines, in pixels."""
     return float(np.median(epipolar_distance(first, second, fundamental_matrix(one, other))))
