@@ -4,7 +4,7 @@ The small model's latents are patches of pixels: no network, no loss.
 """
 
 import copy
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from diffusers import AutoencoderKL
@@ -49,33 +49,6 @@ class Frozen:
         return image.to(weight.dtype)
 
 
-@runtime_checkable
-class Autoencoder(Protocol):
-    """What the denoiser needs to know of its latent space."""
-
-    channels: int
-    factor: int
-    """Image pixels a side of one latent."""
-
-    def encode(
-        self, image: Float[Tensor, "b 3 h w"], generator: torch.Generator | None = None
-    ) -> Float[Tensor, "b c h2 w2"]:
-        """Latents, of about unit spread, of images in [0, 1].
-
-        With a (CPU) generator they are drawn from the posterior, where the latent space has one;
-        without, they are its mode.
-        """
-        ...
-
-    def encode_reference(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c h2 w2"]:
-        """Latents as the denoiser's reference channels expect them."""
-        ...
-
-    def decode(self, latent: Float[Tensor, "b c h2 w2"]) -> Float[Tensor, "b 3 h w"]:
-        """Images, not clamped, of latents."""
-        ...
-
-
 class PixelPatches:
     """Square patches of pixels as channels: exact both ways.
 
@@ -87,20 +60,25 @@ class PixelPatches:
 
     def __init__(self, patch: int) -> None:
         self.factor = patch
+        """Image pixels a side of one latent."""
         self.channels = 3 * patch * patch
 
     def encode(
         self, image: Float[Tensor, "b 3 h w"], generator: torch.Generator | None = None
     ) -> Float[Tensor, "b c h2 w2"]:
-        """See `Autoencoder.encode`; there is no posterior."""
+        """Latents, of about unit spread, of images in [0, 1].
+
+        With a (CPU) generator they are drawn from the posterior, where the latent space has one;
+        without, they are its mode.
+        """
         return functional.pixel_unshuffle((image - 0.5) * self.gain, self.factor)
 
     def encode_reference(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c h2 w2"]:
-        """See `Autoencoder.encode_reference`: the same latents."""
+        """Latents as the denoiser's reference channels expect them: here the same."""
         return self.encode(image)
 
     def decode(self, latent: Float[Tensor, "b c h2 w2"]) -> Float[Tensor, "b 3 h w"]:
-        """See `Autoencoder.decode`."""
+        """Images, not clamped, of latents."""
         return functional.pixel_shuffle(latent, self.factor) / self.gain + 0.5
 
 
@@ -127,7 +105,7 @@ class KlAutoencoder(Frozen):
     def encode(
         self, image: Float[Tensor, "b 3 h w"], generator: torch.Generator | None = None
     ) -> Float[Tensor, "b c h2 w2"]:
-        """See `Autoencoder.encode`."""
+        """See `PixelPatches.encode`."""
         posterior = self._posterior(image)
         latent = posterior.mean.float()
         if generator is not None:
@@ -136,7 +114,7 @@ class KlAutoencoder(Frozen):
         return latent * LATENT_SCALE
 
     def encode_reference(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c h2 w2"]:
-        """See `Autoencoder.encode_reference`: the posterior's mode, not scaled, as in zero123."""
+        """See `PixelPatches.encode_reference`: the posterior's mode, not scaled, as in zero123."""
         return self._posterior(image).mean.float()
 
     @torch.no_grad()
@@ -144,25 +122,17 @@ class KlAutoencoder(Frozen):
         return self.network.encode(self._at(image * 2 - 1)).latent_dist
 
     def decode(self, latent: Float[Tensor, "b c h2 w2"]) -> Float[Tensor, "b 3 h w"]:
-        """See `Autoencoder.decode`."""
+        """See `PixelPatches.decode`."""
         image = self.network.decode(self._at(latent / LATENT_SCALE)).sample
         return image.float() / 2 + 0.5
+
+
+Autoencoder = PixelPatches | KlAutoencoder
 
 
 def build_autoencoder(config: ModelConfig) -> Autoencoder:
     """The configured latent space; a VAE has random weights until some are loaded."""
     return PixelPatches(config.patch) if config.vae is None else KlAutoencoder(config.vae)
-
-
-@runtime_checkable
-class ImageEncoder(Protocol):
-    """Images in [0, 1] to vectors of `width` numbers."""
-
-    width: int
-
-    def __call__(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b d"]:
-        """The embeddings."""
-        ...
 
 
 class SmallImageEncoder(nn.Sequential):
@@ -226,6 +196,6 @@ def clip_input(image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 224 224"]:
     return (resized - mean) / std
 
 
-def build_image_encoder(config: ModelConfig) -> ImageEncoder:
+def build_image_encoder(config: ModelConfig) -> SmallImageEncoder | ClipImageEncoder:
     """The configured encoder; CLIP has random weights until some are loaded."""
     return SmallImageEncoder(_SMALL_WIDTH) if config.clip is None else ClipImageEncoder(config.clip)
