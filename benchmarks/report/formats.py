@@ -77,7 +77,7 @@ def _spreadsheet_text(value: object) -> object:
 def numbers(layout: Layout, width: int) -> str:
     """The panel over everything in plain columns, in as many blocks as the width needs."""
     panel = layout.panels[0]
-    columns = [(panel.heading(metric), f"{n} views") for metric, n in panel.columns]
+    columns = [(metric, f"{n} views") for metric, n in panel.columns]
     frame = pd.DataFrame(
         [[_plain(entry) for entry in row.entries] for row in panel.rows],
         index=[row.label for row in panel.rows],

@@ -3,7 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import pandas as pd
@@ -68,9 +68,8 @@ class Panel:
 
     title: str
     columns: list[tuple[str, int]]
+    """A metric's name with an arrow to its better side, and a number of views."""
     rows: list[Row]
-    own: Mapping[str, MetricConfig] = field(default_factory=dict)
-    """The table's metrics that are not the package's."""
 
     @property
     def metrics(self) -> list[str]:
@@ -82,13 +81,10 @@ class Panel:
         """Every number of views once."""
         return list(dict.fromkeys(n for _, n in self.columns))
 
+    @property
     def headings(self) -> list[str]:
-        """Metric with its arrow and the number of views, per column."""
-        return [f"{self.heading(metric)} {n} views" for metric, n in self.columns]
-
-    def heading(self, metric: str) -> str:
-        """A metric's name with an arrow to its better side."""
-        return f"{name_of(metric)} {_ARROWS[metric_direction(metric, self.own)]}"
+        """One text per column."""
+        return [f"{metric} {n} views" for metric, n in self.columns]
 
 
 @dataclass(frozen=True)
@@ -158,7 +154,9 @@ def _panel(
     counted = f"{captures} capture{'s' if captures > 1 else ''}"
     if captures < FEWEST_CAPTURES:
         counted += ": too few to tell methods apart"
-    return Panel(f"{title} ({counted})", columns, rows, results.plan.table.scoring.own)
+    own = results.plan.table.scoring.own
+    headings = [(_heading(metric, own), n) for metric, n in columns]
+    return Panel(f"{title} ({counted})", headings, rows)
 
 
 def _entry(mean: Any, metric: str) -> Entry:
@@ -207,7 +205,12 @@ def _reported(content: dict[str, Any]) -> Panel:
             for column in columns
         ]
         rows.append(Row(f"{label} (reported)", "", entries))
-    return Panel(f"Reported, not measured here: {content['source']}", columns, rows)
+    headings = [(_heading(metric, {}), n) for metric, n in columns]
+    return Panel(f"Reported, not measured here: {content['source']}", headings, rows)
+
+
+def _heading(metric: str, own: Mapping[str, MetricConfig]) -> str:
+    return f"{name_of(metric)} {_ARROWS[metric_direction(metric, own)]}"
 
 
 def _missing(results: Results) -> list[str]:

@@ -12,7 +12,7 @@ from benchmarks.protocol.draws import Draw, Protocol, is_sealed
 from benchmarks.protocol.prepared_scene import Scene
 from benchmarks.report.aggregate import UNIT, Results, read_results
 from benchmarks.report.formats import tables
-from benchmarks.run.cells import OK, Cell, files_of
+from benchmarks.run.cells import OK, Cell, read_files
 from benchmarks.run.identity import cell_key, image_options, scores_manifest
 from benchmarks.run.plan import TableFolder, selected_draws
 from benchmarks.score import Score
@@ -160,8 +160,7 @@ def _score_problems(
         yield f"{scene.file(changed[0])} is missing, or not what its hash says"
         return
     folder = results.folder.cells / cell.key
-    pictures, points = (files_of(folder, kind) for kind in (cell.images, cell.points))
-    again = score_files(folder, pictures, points, scene, scoring)
+    again = score_files(folder, *read_files(folder, cell), scene, scoring)
     stated = cell.metrics
     for name in dict.fromkeys([*stated, *again]):
         if name in unchecked:

@@ -170,9 +170,13 @@ def planned_cells(folder: Path, plan: Plan) -> list[Cell]:
     return cells
 
 
-def files_of(folder: Path, stated: Mapping[str, str]) -> dict[str, bytes]:
-    """The contents of a finished cell's images or points, by name."""
-    return {name: read_limited(folder / name) for name in stated}
+def read_files(folder: Path, cell: Cell) -> tuple[dict[str, bytes], dict[str, bytes]]:
+    """The contents of a finished cell's images, and of its points, by name."""
+    images, points = (
+        {name: read_limited(folder / name) for name in stated}
+        for stated in (cell.images, cell.points)
+    )
+    return images, points
 
 
 _DRAW = ("category", "sequence", "n_views", "draw", "seed")
@@ -249,7 +253,7 @@ def score_cell(job: CellJob) -> Cell:
     made = read_cell(job.images_from)
     if made is None:
         raise InputError(f"{job.images_from}: is gone; run the table again")
-    images, points = (files_of(job.images_from, kind) for kind in (made.images, made.points))
+    images, points = read_files(job.images_from, made)
     record = replace(_record(job, made, truths_apart=made.truths_apart), status=OK, reason="")
     try:
         scores = score_files(job.images_from, images, points, Scene.open(job.scene), job.scoring)

@@ -1,6 +1,8 @@
 """A small finished table that tests read, or damage a copy of."""
 
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
 
@@ -9,9 +11,19 @@ import pytest
 from tests.benchmarks.tables import run_greys, write_own
 
 
+@contextmanager
+def _few_points() -> Iterator[None]:
+    """Of true surfaces, which take longer than everything else about a small capture."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("benchmarks.protocol.captures.CLOUD_POINTS", 1000)
+        yield
+
+
 @pytest.fixture(autouse=True, scope="module")
-def _rendered_once(rendered_once: None) -> None:
+def _rendered_once(rendered_once: None) -> Iterator[None]:
     """See `rendered_once`."""
+    with _few_points():
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -24,7 +36,8 @@ def own(fork_server: ForkServerContext, tmp_path_factory: pytest.TempPathFactory
 def finished(own: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Its table's output folder; it is only read."""
     output = tmp_path_factory.mktemp("results")
-    assert run_greys(own, output, draws=True) == 0
+    with _few_points():
+        assert run_greys(own, output, draws=True) == 0
     return output
 
 
@@ -32,7 +45,8 @@ def finished(own: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def quick(own: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The output folder of a quick run of the same table; it is only read."""
     output = tmp_path_factory.mktemp("quick")
-    assert run_greys(own, output, quick=True) == 0
+    with _few_points():
+        assert run_greys(own, output, quick=True) == 0
     return output
 
 

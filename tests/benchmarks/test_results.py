@@ -154,7 +154,7 @@ def _layout() -> Layout:
         Row("A & B", "one", [Entry("30.00", 30.0, 1), Entry("–", None)]),
         Row("C_1", "two", [Entry("29.00", 29.0, 2, ties_best=True), Entry("0.2", 0.2, 1)]),
     ]
-    panel = Panel("Everything, random inputs", [("psnr", 3), ("dists", 3)], rows)
+    panel = Panel("Everything, random inputs", [("PSNR ↑", 3), ("DISTS ↓", 3)], rows)
     return Layout("A table", [panel], panel, ["dists: no weights"], ["a note, 95 %"])
 
 

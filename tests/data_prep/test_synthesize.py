@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 import torch
 from captures import write_capture
 
-from data_prep.synthesize import synthesize
+from data_prep.synthesize import CLOUD_POINTS, synthesize
 from extrap_train.config import SyntheticConfig
 from extrap_train.data.co3d import read_category
 from extrap_train.data.synthetic import build_scene, handheld_orbit, render, walk_seed
@@ -26,6 +27,14 @@ def contents(root: Path) -> dict[str, bytes]:
 
 def times(root: Path, name: str) -> dict[str, int]:
     return {p.name: p.stat().st_mtime_ns for p in (root / "apple" / name / "images").iterdir()}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_points() -> Iterator[None]:
+    """The clouds take longer than pictures of this size."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("data_prep.synthesize.CLOUD_POINTS", 500)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -54,10 +63,13 @@ def test_the_reader_finds_what_was_rendered(made):
     assert sequences[1].point_cloud.find() is not None
 
 
-def test_the_same_files_for_any_number_of_workers(made, tmp_path):
+def test_the_same_files_for_any_number_of_workers(tmp_path, monkeypatch):
+    two = replace(SMALL, train_sequences=1, frames=2)
     with LocalLauncher(2) as launcher:
-        synthesize(SMALL, "apple", tmp_path, launcher)
-    assert contents(tmp_path) == contents(made)
+        synthesize(two, "apple", tmp_path / "two", launcher)
+    monkeypatch.setattr("data_prep.synthesize.CLOUD_POINTS", CLOUD_POINTS)  # as those workers do
+    synthesize(two, "apple", tmp_path / "one", LocalLauncher(1))
+    assert contents(tmp_path / "two") == contents(tmp_path / "one")
 
 
 def test_only_what_is_missing_is_rendered(root, made, capsys):
