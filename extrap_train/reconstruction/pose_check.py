@@ -13,7 +13,8 @@ from extrap_train.geometry.epipolar import epipolar_distance, fundamental_matrix
 from extrap_train.matching.sift import descriptor_distance, detect_sift, match_mutual
 from extrap_train.views import Camera, View
 
-Pixels = Float[np.ndarray, "n 2"]
+Pixels = Float[np.ndarray, "_ 2"]
+"""Of as many matches as there are."""
 SIDE = 640
 """Photographs are matched at this many pixels a side, at most."""
 LEAST_MATCHES = 30
