@@ -4,7 +4,7 @@ import hashlib
 import json
 import logging
 import shutil
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -39,8 +39,8 @@ _BYTES_PER_PIXEL = 3 + 2 + 1
 class _Plan:
     """What decides everything about a preparation but where it runs."""
 
-    sequences: Sequence[FrameSequence]
-    capture_keys: Sequence[str]
+    captures: Sequence[tuple[FrameSequence, str]]
+    """With what their frames are made from (`CaptureKeys.frames_key`)."""
     context: PrepContext
     test_names: Collection[str] | int
     key: str
@@ -59,20 +59,20 @@ class _Plan:
         settings = [FORMAT, asdict(options), test, repr(models), FRAMES_VERSION, CORRECTION_VERSION]
         digest = hashlib.sha256(json.dumps(settings).encode())
         depth, size = models.depth_identity, options.image_size
-        capture_keys = []
+        captures = []
         for sequence in sequences:
             keys = CaptureKeys.of(sequence)
-            capture_keys.append(keys.frames_key(depth, size))
+            captures.append((sequence, keys.frames_key(depth, size)))
             qualities = [sequence.viewpoint_quality, sequence.point_cloud_quality]
             traits = [sequence.category, sequence.name, qualities, keys.content, keys.sizes]
             lost = [len(sequence.left_out)] if sequence.left_out else []
             digest.update(json.dumps([*traits, *lost]).encode())
-        return cls(sequences, capture_keys, context, test_names, digest.hexdigest())
+        return cls(captures, context, test_names, digest.hexdigest())
 
     @property
     def keys(self) -> dict[str, str]:
         """What the manifest says: `key`, and `files` of the very files that were read."""
-        files = json.dumps([*self.capture_keys, self.context.correction])
+        files = json.dumps([*(key for _, key in self.captures), self.context.correction])
         return {"key": self.key, "files": hashlib.sha256(files.encode()).hexdigest()}
 
 
@@ -140,7 +140,12 @@ def _is_finished(plan: _Plan, folder: Path, retry: bool) -> bool:
     if failed and retry:
         LOG.warning("%s: %d sequences failed before and are tried again", folder, failed)
         return False
-    damaged = [job.name for job in _finished_jobs(plan, data) if not job.is_there]
+    jobs = [
+        SequenceJob(plan.context, sequence, role, key)
+        for sequence, key in plan.captures
+        if (role := data.roles.get(f"{sequence.category}/{sequence.name}"))
+    ]
+    damaged = [job.name for job in jobs if not job.is_there]
     if damaged:
         LOG.warning(
             "%s: frames or pairs of %d sequences (first: %s) are damaged, gone or replaced: "
@@ -152,23 +157,15 @@ def _is_finished(plan: _Plan, folder: Path, retry: bool) -> bool:
     return not damaged
 
 
-def _finished_jobs(plan: _Plan, data: PreparedData) -> Iterator[SequenceJob]:
-    for sequence, key in zip(plan.sequences, plan.capture_keys, strict=True):
-        role = data.roles.get(f"{sequence.category}/{sequence.name}")
-        if role:
-            yield SequenceJob(plan.context, sequence, role, key)
-
-
 def _make_all(plan: _Plan, launcher: Launcher, progress: bool) -> tuple[list[Outcome], Split]:
     """Every sequence's outcome, and the split of those that are kept.
 
     Who is tested on depends on who is left, so after failures the split is made anew, and what it
     gives another role is made again.
     """
-    verdicts = judge_all(plan.sequences, plan.context.options)
+    verdicts = judge_all([sequence for sequence, _ in plan.captures], plan.context.options)
     outcomes = [
-        Outcome(sequence, verdict, failed=False, capture_key=key)
-        for sequence, verdict, key in zip(plan.sequences, verdicts, plan.capture_keys, strict=True)
+        Outcome(*capture, verdict) for capture, verdict in zip(plan.captures, verdicts, strict=True)
     ]
     made: dict[str, str] = {}
     while True:
@@ -177,14 +174,9 @@ def _make_all(plan: _Plan, launcher: Launcher, progress: bool) -> tuple[list[Out
             raise InputError(_nothing_left(outcomes))
         split = split_sequences(list(kept), plan.test_names)
         roles = {name: split.role(name) for name in kept}
+        shown = progress and len(kept) == 1
         jobs = [
-            SequenceJob(
-                plan.context,
-                outcomes[number].sequence,
-                roles[name],
-                outcomes[number].capture_key,
-                progress=progress and len(kept) == 1,
-            )
+            outcomes[number].job(plan.context, roles[name], progress=shown)
             for name, number in kept.items()
             if made.get(name) != roles[name]
         ]

@@ -33,16 +33,20 @@ class Outcome:
     """What became of a sequence."""
 
     sequence: FrameSequence
-    verdict: Verdict
-    failed: bool
-    """Whether it was good enough, but could not be prepared."""
     capture_key: str
     """What its frames are made from (`CaptureKeys.frames_key`)."""
+    verdict: Verdict
+    failed: bool = False
+    """Whether it was good enough, but could not be prepared."""
 
     @property
     def name(self) -> str:
         """`category/name`, as the prepared data calls it."""
         return f"{self.sequence.category}/{self.sequence.name}"
+
+    def job(self, context: PrepContext, role: str, *, progress: bool = False) -> SequenceJob:
+        """The preparation of the sequence for a role."""
+        return SequenceJob(context, self.sequence, role, self.capture_key, progress)
 
 
 def write_results(
@@ -56,11 +60,8 @@ def write_results(
 
     The manifest also holds `facts`: what the data was made from.
     """
-    jobs = [
-        SequenceJob(context, outcome.sequence, split.role(outcome.name), outcome.capture_key)
-        for outcome in outcomes
-        if outcome.verdict.kept
-    ]
+    kept = [outcome for outcome in outcomes if outcome.verdict.kept]
+    jobs = [outcome.job(context, split.role(outcome.name)) for outcome in kept]
     frames: Counter[str] = Counter()
     pairs: Counter[tuple[str, str]] = Counter()
     _write_table(folder / "frames.parquet", _frame_tables(jobs, frames))
