@@ -61,7 +61,8 @@ def open_logger(config: TrainConfig, folder: RunFolder) -> Iterator[list[Logger]
         with _opened_wandb(folder, options) as logger:
             yield [logger]
     elif config.logger.name == "mlflow":
-        yield [_mlflow(folder, options, Path(config.output))]
+        with _opened_mlflow(folder, options, Path(config.output)) as logger:
+            yield [logger]
     elif config.logger.name == "tensorboard":
         board = TensorBoardLogger(folder.path, name="", version="tensorboard")
         board.experiment.add_text("options", f"```\n{yaml.safe_dump(options, sort_keys=False)}```")
@@ -135,12 +136,17 @@ def _why_offline() -> str | None:
     host = os.environ.get("WANDB_BASE_URL", _WANDB_HOST)
     if "WANDB_API_KEY" not in os.environ and not _has_login(urlsplit(host).hostname or ""):
         return "no WANDB_API_KEY, no login"
+    return _silence_of(host)
+
+
+def _silence_of(address: str) -> str | None:
+    """Why a server does not answer; None where it does, whatever it says."""
     try:
-        urllib.request.urlopen(host, timeout=_ANSWERS_WITHIN_S).close()
+        urllib.request.urlopen(address, timeout=_ANSWERS_WITHIN_S).close()
     except urllib.error.HTTPError:
-        return None  # it has answered
+        return None
     except (OSError, ValueError) as error:
-        return f"no answer from {host}: {getattr(error, 'reason', error)}"
+        return f"no answer from {address}: {getattr(error, 'reason', error)}"
     return None
 
 
@@ -152,7 +158,10 @@ def _has_login(host: str) -> bool:
         return False
 
 
-def _mlflow(folder: RunFolder, options: Mapping[str, Any], output: Path) -> MLFlowLogger:
+@contextmanager
+def _opened_mlflow(
+    folder: RunFolder, options: Mapping[str, Any], output: Path
+) -> Iterator[MLFlowLogger]:
     """At MLFLOW_TRACKING_URI, or in a database beside all results, `mlflow.db`."""
     from mlflow.exceptions import MlflowException
 
@@ -160,6 +169,9 @@ def _mlflow(folder: RunFolder, options: Mapping[str, Any], output: Path) -> MLFl
         logging.getLogger(noisy).setLevel(logging.WARNING)
     output.mkdir(parents=True, exist_ok=True)
     given = os.environ.get("MLFLOW_TRACKING_URI")
+    if given and given.startswith("http") and (silence := _silence_of(given)):
+        # MLflow itself would try for minutes.
+        raise InputError(f"logger=mlflow: {silence}; start it, or mend MLFLOW_TRACKING_URI")
     place = given or f"sqlite:///{output.resolve() / 'mlflow.db'}"
     name, tags = _names(folder)
     note = _id_file(folder, "mlflow")
@@ -176,13 +188,13 @@ def _mlflow(folder: RunFolder, options: Mapping[str, Any], output: Path) -> MLFl
         if not note.is_file():  # MLflow's options of a run are for good
             logger.log_hyperparams(dict(options))
             write_atomic(note, run.encode())
+        terminal().print(f"mlflow: run {run} in {place}")
+        yield logger
     except MlflowException as error:
         raise InputError(
             f"logger=mlflow: {place}: {' '.join(str(error).split())}; mend MLFLOW_TRACKING_URI, or "
-            f"delete {note} to log another run"
+            f"delete {note} to log another run, and run the same command again to resume"
         ) from None
-    terminal().print(f"mlflow: run {run} in {place}")
-    return logger
 
 
 def _id_file(folder: RunFolder, name: str) -> Path:

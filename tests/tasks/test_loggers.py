@@ -91,6 +91,20 @@ def test_a_mlflow_run_that_is_gone_is_one_line(tmp_path: Path) -> None:
         pass
 
 
+def test_a_server_of_mlflow_that_does_not_answer_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("mlflow", reason="needs the extra `tracking`")
+    config = hydrant_config(tmp_path)
+    config.logger = LoggerConfig("mlflow")
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://127.0.0.1:9")
+    with (
+        pytest.raises(InputError, match="MLFLOW_TRACKING_URI"),
+        open_logger(config, opened(config)),
+    ):
+        pass
+
+
 def test_tensorboard_has_options_and_sheets_and_csv_adds_nothing(tmp_path: Path) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
