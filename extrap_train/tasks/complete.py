@@ -229,13 +229,11 @@ def _pipeline(job: _Job) -> CompletionPipeline:
     generator = scene_generator(config, trained_model(config).to(device_of(config)))
     # A generated view brings no depth along.
     own = config.depth
-    source = StereoConfig() if isinstance(own, DatasetDepthConfig) else own
+    source = depth_source(StereoConfig() if isinstance(own, DatasetDepthConfig) else own)
     completion = None
     if job.depth_network is not None:
-        completion = NetworkCompletion(load_depth_network(job.depth_network))
-    return CompletionPipeline(
-        generator, depth_source(source), config.complete, config.seed, completion
-    )
+        completion = NetworkCompletion(load_depth_network(job.depth_network), source)
+    return CompletionPipeline(generator, source, config.complete, config.seed, completion)
 
 
 def _started_map(job: _Job, pipeline: CompletionPipeline, console: Console) -> GlobalMap:

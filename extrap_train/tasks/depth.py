@@ -2,19 +2,29 @@
 
 from collections.abc import Iterable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 
-from extrap_train.config import SyntheticConfig, TrainConfig, dotted
-from extrap_train.data.synthetic import build_scene, render
-from extrap_train.data.synthetic.capture import handheld_orbit, sequence_name, walk_seed
+from extrap_train.config import (
+    DatasetDepthConfig,
+    DepthConfig,
+    StereoConfig,
+    SyntheticConfig,
+    TrainConfig,
+    dotted,
+)
+from extrap_train.data.scene_spec import SYNTHETIC_SCHEME, open_scene
+from extrap_train.data.synthetic import build_scene, trace
+from extrap_train.data.synthetic.capture import sequence_name, walk_seed
+from extrap_train.depth.sources import depth_source
 from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.diffusion.packaged import packaged_name
 from extrap_train.errors import InputError
 from extrap_train.reconstruction.depth_completion.calibration import DepthScores, calibrate
-from extrap_train.reconstruction.depth_completion.examples import LEAST_FRAMES, draw_examples
+from extrap_train.reconstruction.depth_completion.examples import draw_examples
 from extrap_train.reconstruction.depth_completion.network import save_depth_network
 from extrap_train.reconstruction.depth_completion.network_training import (
     DepthTraining,
@@ -28,7 +38,6 @@ from extrap_train.store.records import write_summary
 from extrap_train.tasks.scene_model import open_model
 from extrap_train.terminal import progress, terminal
 
-EXAMPLES_PER_CAPTURE = 16
 _TRAINER_OPTIONS = ("batch_size", "warmup_steps", "lr_decay_start", "ema_decay")
 """What a run depends on; steps and checkpoints may change when it is continued."""
 
@@ -44,10 +53,6 @@ def run(config: TrainConfig) -> Outcome:
         raise InputError(
             f"data={data.name}: task=depth needs captures whose depth is known everywhere; use "
             "data=synthetic"
-        )
-    if data.frames < LEAST_FRAMES:
-        raise InputError(
-            f"data.frames={data.frames}: task=depth needs at least {LEAST_FRAMES} a capture"
         )
     folder = Path(config.output) / "depth" / (given_name(config) or config.category.name)
     with claim(folder, _manifest(config), resume=config.resume) as claimed:
@@ -73,10 +78,22 @@ def run(config: TrainConfig) -> Outcome:
 
 
 def _manifest(config: TrainConfig) -> Manifest:
-    options = dotted({"category": asdict(config.category), "data": asdict(config.data)})
+    options = dotted(
+        {
+            "category": asdict(config.category),
+            "data": asdict(config.data),
+            "depth": asdict(_measuring(config)),
+        }
+    )
     del options["data.train_sequences"]  # a run may be continued with more captures
     trainer = {f"trainer.{name}": getattr(config.trainer, name) for name in _TRAINER_OPTIONS}
     return Manifest.of(options | trainer | {"seed": config.seed})
+
+
+def _measuring(config: TrainConfig) -> DepthConfig:
+    """What measures generated views, which bring no depth along."""
+    own = config.depth
+    return StereoConfig() if isinstance(own, DatasetDepthConfig) else own
 
 
 def _example_file(folder: Path, category: str, index: int) -> Path:
@@ -94,14 +111,19 @@ def _draw_missing(
     """Draw the examples of every capture that has no file yet, with the packaged generators."""
     wanted = [(member, index) for index in indices for member in config.category.members]
     missing = [pair for pair in wanted if not _example_file(folder, *pair).is_file()]
+    source = depth_source(_measuring(config))
     generators = {member: _generator(member) for member in {member for member, _ in missing}}
     with progress("drawing examples", len(missing), "captures") as bar:
         for category, index in missing:
-            scene, walk = build_scene(category, index, data.seed), (category, index, data.seed)
-            cameras = handheld_orbit(scene, data.frames, data.image_size, walk_seed(*walk))
-            views = [render(scene, cameras[i], supersample=1) for i in range(data.frames)]
-            rng = np.random.default_rng((config.seed, walk_seed(*walk)))
-            examples = draw_examples(views, generators[category], EXAMPLES_PER_CAPTURE, rng)
+            name = sequence_name(index)
+            rng = np.random.default_rng((config.seed, walk_seed(category, index, data.seed)))
+            examples = draw_examples(
+                open_scene(f"{SYNTHETIC_SCHEME}{category}/{name}", data).frames,
+                partial(trace, build_scene(category, index, data.seed)),
+                generators[category],
+                source,
+                rng,
+            )
             save_examples(examples, _example_file(folder, category, index))
             bar.advance()
 

@@ -6,18 +6,16 @@ import numpy as np
 import pytest
 import scenes
 import torch
-from in_process import run_command
 
-from extrap_train.__main__ import main
 from extrap_train.config import CompletionConfig, TrainerConfig
+from extrap_train.data.sequences import Frame
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError
 from extrap_train.geometry.visibility import Ball
 from extrap_train.reconstruction.completion import CompletionPipeline, add_view, map_of_inputs
 from extrap_train.reconstruction.depth_completion.calibration import calibrate
 from extrap_train.reconstruction.depth_completion.examples import (
-    LEAST_FRAMES,
-    _draw_frames,
+    DepthExamples,
     draw_examples,
     with_truth,
 )
@@ -43,7 +41,7 @@ from extrap_train.reconstruction.depth_completion.observation import (
     CERTAIN,
     CHANNELS,
     ENTRY,
-    PRIOR,
+    MEASURED,
     observe,
 )
 from extrap_train.reconstruction.planner import Query
@@ -82,6 +80,7 @@ def observed(query: View, references: list[View]):
         (depths > 0).float(),
         stack_cameras([cameras]),
         Ball.around(cameras),
+        *torch.zeros(2, 1, SIZE, SIZE),
     )
 
 
@@ -94,7 +93,7 @@ def test_what_is_certain_is_right_and_no_surface_lies_in_front_of_unobserved_spa
         query = photograph(azimuth)
         seen = observed(query, front())
         certain = seen.features[0, CERTAIN] > 0
-        prior = seen.depth(seen.features[:, PRIOR])[0]
+        prior = seen.depth(seen.features[:, MEASURED])[0]
         off = (prior / query.depth - 1).abs()[certain]
         assert (off < 0.03).float().mean() > 0.97
         on_ball = (query.mask > 0.5) & ~certain
@@ -159,11 +158,31 @@ def test_depth_meets_what_is_known_at_the_rim():
     assert torch.equal(unrelated[8:], found[8:] + 1)
 
 
+def ball_frame(azimuth_deg: float) -> Frame:
+    view = photograph(azimuth_deg)
+
+    def load(*, depth: bool = True) -> View:
+        return view
+
+    return Frame(view.name, view.camera, True, True, load, ())
+
+
+def truth(camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
+    depth = BALL.depth(camera)
+    return depth, (depth != PLANE.depth(camera)).float()
+
+
 @pytest.fixture(scope="module")
-def stored(tmp_path_factory) -> StoredExamples:
+def drawn() -> DepthExamples:
+    frames = [ball_frame(azimuth) for azimuth in range(0, 360, 15)]
+    rng = np.random.default_rng(0)
+    return draw_examples(frames, truth, ExactGenerator(), DatasetDepth(), rng)
+
+
+@pytest.fixture(scope="module")
+def stored(drawn, tmp_path_factory) -> StoredExamples:
     path = tmp_path_factory.mktemp("examples") / "ball.npy"
-    views = [photograph(azimuth) for azimuth in range(0, 360, 30)]
-    save_examples(draw_examples(views, None, 8, np.random.default_rng(0)), path)
+    save_examples(drawn, path)
     return StoredExamples([path])
 
 
@@ -174,7 +193,9 @@ def test_a_tiny_network_learns_the_back_of_the_ball(stored, tmp_path):
     for _ in range(20):
         training.advance(stored)
     query = photograph(165.0)
-    save_examples(with_truth(observed(query, front()), query), tmp_path / "back.npy")
+    save_examples(
+        with_truth(observed(query, front()), query.depth, query.mask), tmp_path / "back.npy"
+    )
     (back,) = StoredExamples([tmp_path / "back.npy"]).captures()
     with torch.inference_mode():
         learnt, untrained = (
@@ -256,7 +277,7 @@ def test_the_network_keeps_what_the_map_is_certain_of():
     views = [replace(view, mask=None) for view in front()]
     known = map_of_inputs(views, [(view.depth > 0).float() for view in views], 0.01)
     picture = replace(photograph(40.0), depth=None, mask=None)
-    found = NetworkCompletion(DepthNetwork().eval())(known, picture, [0, 1, 2])
+    found = NetworkCompletion(DepthNetwork().eval(), DatasetDepth())(known, picture, [0, 1, 2])
     off = (found.depth / BALL.depth(picture.camera) - 1).abs()
     assert found.certain.float().mean() > 0.3
     assert (off[found.certain] < 0.03).float().mean() > 0.95
@@ -265,22 +286,16 @@ def test_the_network_keeps_what_the_map_is_certain_of():
 
 def test_with_truth_weighs_nothing_where_the_truth_is_unknown():
     query = photograph(90.0)
-    holed = replace(query, depth=torch.where(query.mask > 0.5, 0, query.depth))
-    weight = with_truth(observed(query, front()), holed).weight[0]
+    holed = torch.where(query.mask > 0.5, 0, query.depth)
+    weight = with_truth(observed(query, front()), holed, query.mask).weight[0]
     assert (weight[query.mask > 0.5] == 0).all()
-    assert (weight[holed.depth > 0] > 0).all()
+    assert (weight[holed > 0] > 0).all()
 
 
-@pytest.mark.parametrize("frames", [LEAST_FRAMES, LEAST_FRAMES + 1, 16])
-def test_every_draw_has_a_query_that_is_no_reference(frames):
-    for seed in range(200):
-        draw = _draw_frames(frames, np.random.default_rng(seed))
-        assert draw.query not in draw.references
-        assert {*draw.inputs} <= {*draw.references} <= {*range(frames)}
-
-
-def test_captures_of_too_few_photographs_are_refused(tmp_path):
-    few = f"data.frames={LEAST_FRAMES - 1}"
-    said = run_command(main, "task=depth", "category=cup", few, f"output={tmp_path}", status=1)
-    assert said.startswith(f"error: {few}")
-    assert not [*tmp_path.iterdir()]
+def test_examples_are_what_completion_observes_with_the_true_depth(drawn):
+    """Twice for every generated view; where the map is certain, it shows the truth."""
+    assert len(drawn.log_depth) % 2 == 0
+    certain = drawn.seen.certain & (drawn.weight > 0)
+    off = (drawn.seen.warp_log_depth - drawn.log_depth).abs()
+    assert certain.float().mean() > 0.1
+    assert (off[certain] < 0.05).float().mean() > 0.9

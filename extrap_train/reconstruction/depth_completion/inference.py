@@ -10,11 +10,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
+from extrap_train.depth import DepthSource
 from extrap_train.geometry.visibility import Ball
 from extrap_train.reconstruction.continuation import extend_harmonically, neighbour_ties
 from extrap_train.reconstruction.depth_completion.network import DepthNetwork
-from extrap_train.reconstruction.depth_completion.observation import observe
+from extrap_train.reconstruction.depth_completion.observation import Observation, observe
 from extrap_train.reconstruction.global_map import GlobalMap
+from extrap_train.reconstruction.measurement import measure
 from extrap_train.views import View, resample_surfaces, stack_cameras
 
 WORKING_SIZE = 128
@@ -37,6 +39,14 @@ class CompletedDepth:
     certain: Bool[Tensor, "h w"]
     """Where the map shows a surface through space that was seen to be empty."""
 
+    def resized(self, height: int, width: int) -> "CompletedDepth":
+        """The same for a picture of another size."""
+        if self.depth.shape == (height, width):
+            return self
+        maps = torch.stack([self.depth, self.confidence, self.certain.to(self.depth.dtype)])
+        depth, confidence, certain = resample_surfaces(maps, (height, width))
+        return CompletedDepth(depth, confidence.clamp(0, 1), certain > 0.5)
+
 
 class DepthCompletion(Protocol):
     """Whatever completes the depth of a generated view; a test's oracle is one, too."""
@@ -51,32 +61,42 @@ class NetworkCompletion:
     """The network's answer, corrected so that it meets the map where that is certain."""
 
     network: DepthNetwork
+    source: DepthSource
+    """Measures what the network starts from."""
 
     @torch.inference_mode()
     def __call__(self, known: GlobalMap, picture: View, indices: Sequence[int]) -> CompletedDepth:
         """See `DepthCompletion`."""
-        views = [known.views[index] for index in indices]
-        size = (WORKING_SIZE, WORKING_SIZE)
-        image = functional.interpolate(picture.image[None], size, mode="area")
-        cameras = stack_cameras([view.camera for view in views])
-        seen = observe(
-            image,
-            stack_cameras([picture.camera.resized(*size)]),
-            torch.stack([view.view.image for view in views])[None],
-            torch.stack([view.depth for view in views])[None],
-            torch.stack([view.confidence for view in views])[None],
-            stack_cameras([cameras]),
-            Ball.around(known.cameras),
-        )
+        seen = observe_in_map(known, picture, indices, self.source)
         log_depth, confidence = self.network(seen.features).best()
         fitted = fit_to_known(log_depth[0], seen.warp_log_depth[0], seen.certain[0])
-        maps = torch.stack(
-            [seen.depth(fitted[None])[0], confidence[0], seen.certain[0].to(confidence.dtype)]
+        completed = CompletedDepth(
+            seen.depth(fitted[None])[0], confidence[0].clamp(0, 1), seen.certain[0]
         )
-        height, width = picture.camera.height, picture.camera.width
-        if (height, width) != size:
-            maps = resample_surfaces(maps, (height, width))
-        return CompletedDepth(maps[0], maps[1].clamp(0, 1), maps[2] > 0.5)
+        return completed.resized(picture.camera.height, picture.camera.width)
+
+
+def observe_in_map(
+    known: GlobalMap, picture: View, indices: Sequence[int], source: DepthSource
+) -> Observation:
+    """Describe a picture at the network's size by what the map's views `indices` show of it."""
+    views = [known.views[index] for index in indices]
+    size = (WORKING_SIZE, WORKING_SIZE)
+    found = measure(known, picture, indices, source)
+    measured = torch.stack([found.depth, found.confidence]) * found.reliable
+    if measured.shape[-2:] != size:
+        measured = resample_surfaces(measured, size)
+    return observe(
+        functional.interpolate(picture.image[None], size, mode="area"),
+        stack_cameras([picture.camera.resized(*size)]),
+        torch.stack([view.view.image for view in views])[None],
+        torch.stack([view.depth for view in views])[None],
+        torch.stack([view.confidence for view in views])[None],
+        stack_cameras([stack_cameras([view.camera for view in views])]),
+        Ball.around(known.cameras),
+        measured[:1],
+        measured[1:],
+    )
 
 
 def fit_to_known(

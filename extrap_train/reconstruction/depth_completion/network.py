@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from extrap_train.reconstruction.depth_completion.observation import CHANNELS, ENTRY, PRIOR
+from extrap_train.reconstruction.depth_completion.observation import CHANNELS, ENTRY, MEASURED
 from extrap_train.weight_files import WeightFile, write_tensors
 
 PATCH = 4
@@ -79,7 +79,7 @@ class DepthNetwork(nn.Module):
             nn.init.zeros_(parameter)
 
     def forward(self, features: Float[Tensor, "b c h w"]) -> DepthMixture:
-        """One mode starts at the prior, the other where the ray enters unobserved space."""
+        """One mode starts at what was measured, the other where the ray enters unobserved space."""
         x = self.stem(functional.pixel_unshuffle(features, PATCH))
         kept = []
         for level, encode in enumerate(self.encode):
@@ -89,7 +89,7 @@ class DepthNetwork(nn.Module):
             x = functional.interpolate(x, scale_factor=2.0, mode="nearest")
             x = self.decode[level](self.up[level](torch.cat([kept[level], x], 1)))
         out = functional.pixel_shuffle(self.head(functional.silu(x)), PATCH)
-        start = features[:, [PRIOR, ENTRY]]
+        start = features[:, [MEASURED, ENTRY]]
         low, high = (torch.tensor(scale).log().item() for scale in _SCALES)
         return DepthMixture(
             modes=start + out[:, 0:2],

@@ -11,8 +11,8 @@ from extrap_train.geometry.visibility import Ball, trace_visibility
 from extrap_train.geometry.warp import warp_references
 from extrap_train.views import Camera
 
-CHANNELS = 17
-ENTRY, PRIOR, CERTAIN = 10, 13, 14
+CHANNELS = 19
+ENTRY, CERTAIN, MEASURED = 10, 14, 15
 """Channels that others read: where the network's answer starts, and where it is known."""
 LARGEST_UNOBSERVED = 0.04
 """In radii of the ball: with more unobserved space in front of it, a warped surface is a
@@ -27,8 +27,9 @@ class Observation:
     """Log depths are relative to the depth of the scene's centre, so nothing has a unit."""
 
     features: Float[Tensor, "b c h w"]
-    """`PRIOR`: log depth of the certain warp, holes filled smoothly. `ENTRY`: log depth at which
-    the ray enters unobserved space; the prior where it never does."""
+    """`MEASURED`: log depth that the depth source measured; where it found nothing, the certain
+    warp's, holes filled smoothly. `ENTRY`: log depth at which the ray enters unobserved space; the
+    filled warp's where it never does."""
     center_depth: Float[Tensor, " b"]
     certain: Bool[Tensor, "b h w"]
     """Where the warp shows a surface through space that was seen to be empty."""
@@ -48,8 +49,11 @@ def observe(
     confidences: Float[Tensor, "b k h2 w2"],
     cameras: Camera,
     ball: Ball,
+    measured: Float[Tensor, "b h w"],
+    measured_confidence: Float[Tensor, "b h w"],
 ) -> Observation:
-    """Describe each query by its picture and by what its references show and leave open.
+    """Describe each query by its picture, by what its references show and leave open, and by what
+    a depth source measured.
 
     `query` is batched `b` and `cameras` `b k`; depth 0 is unknown.
     """
@@ -86,6 +90,8 @@ def observe(
         torch.where(enters, leaves, 0),
         prior,
         certain.to(prior.dtype),
+        torch.where(measured > 0, _log(measured / scale), prior),
+        torch.where(measured > 0, measured_confidence, 0),
         u.expand_as(prior),
         v.expand_as(prior),
     ]
