@@ -1,13 +1,17 @@
 """How good the network's depth is on held-out examples, and whether its confidence is true."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from extrap_train.reconstruction.depth_completion.network import CONFIDENT_WITHIN, DepthNetwork
+from extrap_train.reconstruction.depth_completion.network import (
+    CONFIDENT_WITHIN,
+    DepthMixture,
+    DepthNetwork,
+)
 from extrap_train.reconstruction.depth_completion.observation import CERTAIN, CHANNELS
 
 BINS = 10
@@ -32,56 +36,54 @@ class DepthScores:
     """Mean absolute difference of confidence and share within, over bins of confidence."""
 
 
-@dataclass(frozen=True)
-class _Pixels:
-    error: Float[Tensor, " n"]
-    confidence: Float[Tensor, " n"]
-
-    def scores(self) -> DepthScores:
-        within = self.error <= CONFIDENT_WITHIN
-        said = self.confidence >= 0.5
-        return DepthScores(
-            float(self.error.median()),
-            float(within.float().mean()),
-            float(said.float().mean()),
-            float(within[said].float().mean()),
-            self.calibration_error(within),
-        )
-
-    def calibration_error(self, within: Bool[Tensor, " n"]) -> float:
-        place = (self.confidence * BINS).long().clamp(max=BINS - 1)
-        count = torch.bincount(place, minlength=BINS)
-        sums = [torch.bincount(place, x, minlength=BINS) for x in (self.confidence, within.float())]
-        return float((sums[0] - sums[1]).abs().sum() / count.sum())
-
-
 @torch.inference_mode()
-def _pixels(network: DepthNetwork, batches: Iterable[Float[Tensor, "b c h w"]]) -> _Pixels:
-    errors, confidences = [], []
-    for batch in batches:
-        log_depth, confidence = network(batch[:, :CHANNELS]).best()
-        truth, weight = batch[:, CHANNELS], batch[:, CHANNELS + 1]
-        chosen = (weight >= _ON_OBJECT) & (batch[:, CERTAIN] == 0)
-        errors.append(((log_depth - truth).exp() - 1).abs()[chosen])
-        confidences.append(confidence[chosen])
-    return _Pixels(torch.cat(errors), torch.cat(confidences))
-
-
-def score_depth(network: DepthNetwork, batches: Iterable[Float[Tensor, "b c h w"]]) -> DepthScores:
-    """Scores over stored examples, as `network_training.StoredExamples.captures` gives them."""
-    return _pixels(network, batches).scores()
-
-
 def calibrate(network: DepthNetwork, batches: Iterable[Float[Tensor, "b c h w"]]) -> DepthScores:
     """Set the factor on all spreads that makes the confidence truest; returns the scores with it.
 
-    `batches` must be of captures that the network was not trained on.
+    `batches` are stored examples, as `network_training.StoredExamples.captures` gives them, of
+    captures that the network was not trained on.
     """
-    kept = list(batches)
+    network.spread_factor.fill_(1)
+    mixture, truth = _pixels(network, batches)
     found = []
     for factor in _FACTORS.tolist():
-        network.spread_factor.fill_(factor)
-        found.append((score_depth(network, kept), factor))
+        scaled = replace(mixture, spreads=mixture.spreads * factor)
+        found.append((_score(scaled, truth), factor))
     scores, factor = min(found, key=lambda pair: pair[0].calibration_error)
     network.spread_factor.fill_(factor)
     return scores
+
+
+def _pixels(
+    network: DepthNetwork, batches: Iterable[Float[Tensor, "b c h w"]]
+) -> tuple[DepthMixture, Float[Tensor, "1 1 n"]]:
+    """The network's answer and the true log depth, pixels in a row."""
+    answers, truths = [], []
+    for batch in batches:
+        chosen = (batch[:, CHANNELS + 1] >= _ON_OBJECT) & (batch[:, CERTAIN] == 0)
+        found = network(batch[:, :CHANNELS])
+        maps = torch.stack([found.modes, found.spreads, found.log_shares])
+        answers.append(maps.movedim(2, -1)[:, chosen])
+        truths.append(batch[:, CHANNELS][chosen])
+    modes, spreads, log_shares = torch.cat(answers, 1).mT[:, None, :, None]
+    return DepthMixture(modes, spreads, log_shares), torch.cat(truths)[None, None]
+
+
+def _score(mixture: DepthMixture, truth: Float[Tensor, "1 1 n"]) -> DepthScores:
+    log_depth, confidence = mixture.best()
+    error = ((log_depth - truth).exp() - 1).abs().flatten()
+    confidence = confidence.flatten()
+    within, said = error <= CONFIDENT_WITHIN, confidence >= 0.5
+    return DepthScores(
+        float(error.median()),
+        float(within.float().mean()),
+        float(said.float().mean()),
+        float(within[said].float().mean()),
+        _calibration_error(confidence, within),
+    )
+
+
+def _calibration_error(confidence: Float[Tensor, " n"], within: Bool[Tensor, " n"]) -> float:
+    place = (confidence * BINS).long().clamp(max=BINS - 1)
+    sums = [torch.bincount(place, x, minlength=BINS) for x in (confidence, within.float())]
+    return float((sums[0] - sums[1]).abs().sum() / len(confidence))
