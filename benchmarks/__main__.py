@@ -13,7 +13,7 @@ from extrap_train.config import TableConfig
 from extrap_train.errors import InputError
 from extrap_train.exits import Ended, ends_in_one_line
 
-PERF_NAMES = ("align", "average", "gaussians", "prep", "sample", "train", "warp")
+PERF_NAMES = ("align", "average", "gaussians", "prep", "sample", "stereo", "train", "warp")
 KINDS = ("methods", "tables", "categories")
 FORMATS = ("csv", "md", "latex", "html")
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from extrap_train.depth.photo_cost import PhotoCost, projection_between
-from extrap_train.depth.plane_sweep_numba import add_paths_numba
+from extrap_train.depth.plane_sweep_numba import semi_global_numba
 from extrap_train.geometry.warp import needs_torch
 from extrap_train.views import View
 
@@ -119,6 +119,8 @@ SMALL_STEP = 0.03
 """Penalty of a change by one hypothesis between neighbouring pixels (cost is in [0, 1])."""
 JUMP = 0.6
 """Penalty of a larger change within one colour; it falls where colour changes."""
+PATHS_AT_A_TIME = 4
+"""Directions that are summed in parallel on the CPU; each takes as much memory as the cost."""
 EDGE_CONTRAST = 0.05
 """Colour difference that halves the penalty of a jump."""
 
@@ -133,14 +135,17 @@ def semi_global_cost(
     if needs_torch(cost, image):
         return semi_global_torch(cost, image)
     planes_last = cost.permute(1, 2, 0).contiguous()
-    total = torch.zeros_like(planes_last)
-    for step in product((-1, 0, 1), repeat=2):
-        if step != (0, 0):
-            penalty = _jump_penalty(image, *step).contiguous().numpy()
-            add_paths_numba(
-                planes_last.numpy(), penalty, *step, np.float32(SMALL_STEP), total.numpy()
-            )
-    return total.permute(2, 0, 1) / 8
+    steps = [step for step in product((-1, 0, 1), repeat=2) if step != (0, 0)]
+    penalties = torch.stack([_jump_penalty(image, *step) for step in steps])
+    totals = cost.new_zeros(PATHS_AT_A_TIME, *planes_last.shape)
+    semi_global_numba(
+        planes_last.numpy(),
+        penalties.numpy(),
+        np.array(steps),
+        np.float32(SMALL_STEP),
+        totals.numpy(),
+    )
+    return totals.sum(0).permute(2, 0, 1) / len(steps)
 
 
 def semi_global_torch(

@@ -124,12 +124,20 @@ def mean_of_better_numba(costs, out):
             out[plane, row, column] = total / np.float32(seen) if seen > 0 else _HALF
 
 
-@compiled()
-def add_paths_numba(cost, penalty, row_step, column_step, small_step, total):
-    """Add the least costs of the paths that come by (`row_step`, `column_step`) to `total`.
+@compiled(parallel=True)
+def semi_global_numba(cost, penalties, steps, small_step, totals):
+    """Add the least costs of the paths that come by each of `steps` (rows, columns); `totals` has
+    several shares of the sum, each the size of `cost`, which are summed at the same time.
 
-    `cost` and `total` are height × width × planes; `penalty` is that of a jump into each pixel.
+    `cost` is height × width × planes; a step's `penalty` is that of a jump into each pixel.
     """
+    for share in numba.prange(len(totals)):
+        for i in range(share, len(steps), len(totals)):
+            _add_paths(cost, penalties[i], steps[i, 0], steps[i, 1], small_step, totals[share])
+
+
+@compiled()
+def _add_paths(cost, penalty, row_step, column_step, small_step, total):
     height, width, planes = cost.shape
     # The ends beyond the first and the last plane stay infinite.
     before, paths = np.full((2, width, planes + 2), _INFINITY, np.float32)
