@@ -1,5 +1,17 @@
-"""Captures on disk to `FrameSequence`s: CO3D, `transforms.json` folders, COLMAP models.
+"""Captures on disk to `FrameSequence`s, and prepared frames to the batches of training.
 
 Everything read here comes from outside: paths never leave the data set's root, sizes are compared
 before anything of that size is allocated, and what cannot be used raises `InputError` in one line.
+
+| step | modules |
+|---|---|
+| a capture by what a person typed | `scene_spec` |
+| its description, in each format | `co3d`, `transforms_json` (`lens_keys`), `colmap`, `synthetic` |
+| photographs that come without one | `estimated_poses` (`structure_from_motion`) |
+| from descriptions to frames not yet read | `listed_photographs`, `listed_files`, `sequences` |
+| files to pixels | `image_files`, `depth_files` |
+| whether paths, JSON and cameras are sound | `paths`, `json_files`, `camera_check` |
+| photographs to squares with depth | `square_frames` |
+| squares on disk and back | `frame_files` (`frame_codec`), `prepared` |
+| a query and its references to a batch | `examples`, `module`; of one scene `scene_pairs` |
 """

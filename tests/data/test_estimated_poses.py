@@ -112,6 +112,23 @@ def test_turned_photographs_are_read_upright(photographs, opened):
         assert (image - view.image).abs().mean() < 0.05  # JPEG; another view differs by 0.15
 
 
+@pytest.mark.usefixtures("opened", "no_mapping")
+def test_photographs_keep_their_cameras_when_masks_are_put_beside_them(photographs, tmp_path):
+    """Masks are no photographs, and upright as the pictures are shown."""
+    folder = tmp_path / photographs[0].name
+    shutil.copytree(photographs[0], folder)
+    (folder / "masks").mkdir()
+    half = np.zeros((HEIGHT, WIDTH), np.uint8)
+    half[: HEIGHT // 2] = 255
+    for number, view in enumerate(photographs[1]):
+        name = f"masks/{view.name}.png" if number else "0_mask.png"
+        Image.fromarray(half).save(folder / name)
+    for frame in open_scene(str(folder)).frames:
+        mask = frame.load().mask
+        assert mask[: HEIGHT // 2].min() == 1
+        assert mask[HEIGHT // 2 + 2 :].max() < 0.1  # but for the lens that is undone
+
+
 def test_what_cannot_be_placed_is_named_in_one_warning(photographs, opened, caplog):
     with caplog.at_level(logging.WARNING):
         again = open_scene(str(photographs[0]))
