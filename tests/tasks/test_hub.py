@@ -21,7 +21,8 @@ from extrap_train.__main__ import main
 from extrap_train.config import packaged_names
 from extrap_train.diffusion import hub as hub_module
 from extrap_train.diffusion.hub import is_repository
-from extrap_train.diffusion.model_files import ancestors, load_model
+from extrap_train.diffusion.leakage import trainings_of
+from extrap_train.diffusion.model_files import initial_model, load_model, saved_config
 from extrap_train.errors import InputError
 from extrap_train.runs import run_manifest
 from extrap_train.tasks.scene_model import UsedWeights
@@ -113,8 +114,10 @@ def test_results_and_trainings_follow_from_the_content_of_a_repository(
     started = replace(config, model=replace(config.model, start="me/downloaded"))
     started.category.members = []
     assert run_manifest(started, []).inputs == {"model.start": used.sha256}
-    ((name, manifest),) = ancestors("me/downloaded")
-    assert (name, manifest.split["hydrant"].train) == ("me/downloaded", ("0001",))
+    (training,) = trainings_of("me/downloaded")
+    assert (training.model, training.split.train) == ("me/downloaded", ("0001",))
+    model = initial_model(replace(saved_config(downloaded), start="me/downloaded"))
+    assert torch.equal(model.unet.conv_in.weight, load_model(downloaded).unet.conv_in.weight)
 
 
 def test_a_table_compares_a_repository(downloaded: Path) -> None:
