@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Shaped, UInt16
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from extrap_train.data.image_files import (
@@ -44,54 +44,39 @@ class DepthFile:
     """Whether the 16 bits of its pixels are CO3D's float16, no whole numbers."""
 
     def read(self, root: Path, size: tuple[int, int]) -> Float[Tensor, "h w"]:
-        """The depth in scene units at `size` (height, width); 0 where unknown or not trusted."""
+        """The depth in scene units at `size` (height, width); 0 where unknown or not trusted.
+
+        A greyscale picture of 16 bits, a TIFF of 32, or an NPY array, of the shape of `size`: it is
+        resampled from the nearest pixels. An empty map, and a scale that cannot be, is an error.
+        """
         path = root / self.path
         if self.is_half_float:
-            depth = known_depth(read_sixteen_bit(path, size).view(np.float16), self.scale, path)
+            raw = np.asarray(read_picture(path, size, _SIXTEEN_BIT_MODES))
+            raw = raw.astype(np.uint16).view(np.float16)
+        elif path.suffix.lower() == ".npy":
+            raw = _read_npy(path, size)
         else:
-            depth = read_depth(path, size, self.scale)
+            raw = np.asarray(read_picture(path, size, _DEPTH_MODES))
+        depth = self._in_scene_units(nearest_pixels(raw, size), path)
         if self.mask_path:
             depth *= torch.from_numpy(read_grey(root / self.mask_path, size) > 0)
         return depth
 
-
-def read_depth(path: Path, size: tuple[int, int], scale: float) -> Float[Tensor, "h w"]:
-    """A depth map, times `scale`: greyscale of 16 bits, a TIFF of 32, or an NPY array.
-
-    0 is unknown. A map of the same shape as `size` is resampled to it, from the nearest pixels.
-    """
-    if path.suffix.lower() == ".npy":
-        raw = _read_npy(path, size)
-    else:
-        raw = np.asarray(read_picture(path, size, _DEPTH_MODES))
-    return known_depth(nearest_pixels(raw, size), scale, path)
-
-
-def read_sixteen_bit(path: Path, size: tuple[int, int]) -> UInt16[np.ndarray, "h w"]:
-    """The raw values of a greyscale PNG of 16 bits a pixel, resampled to `size`."""
-    raw = np.asarray(read_picture(path, size, _SIXTEEN_BIT_MODES)).astype(np.uint16)
-    return nearest_pixels(raw, size)
-
-
-def known_depth(raw: Shaped[np.ndarray, "h w"], scale: float, path: Path) -> Float[Tensor, "h w"]:
-    """`raw` × `scale`, 0 where that is not positive and finite.
-
-    An empty map, and a scale that cannot be, is an error that names `path`.
-    """
-    if not 0 < scale < MAX_DEPTH_SCALE:
-        raise InputError(
-            f"{path}: the scale of its depth is {scale}, no possible one; correct its entry or "
-            "estimate depth (depth=stereo)"
-        )
-    with np.errstate(invalid="ignore", over="ignore"):
-        depth = raw.astype(np.float32) * np.float32(scale)
-    depth[~(np.isfinite(depth) & (depth > 0))] = 0
-    if not depth.any():
-        raise InputError(
-            f"{path}: the depth map is zero everywhere; remove it or its frame, or estimate depth "
-            "(depth=stereo)"
-        )
-    return torch.from_numpy(depth)
+    def _in_scene_units(self, raw: Shaped[np.ndarray, "h w"], path: Path) -> Float[Tensor, "h w"]:
+        if not 0 < self.scale < MAX_DEPTH_SCALE:
+            raise InputError(
+                f"{path}: the scale of its depth is {self.scale}, no possible one; correct its "
+                "entry or estimate depth (depth=stereo)"
+            )
+        with np.errstate(invalid="ignore", over="ignore"):
+            depth = raw.astype(np.float32) * np.float32(self.scale)
+        depth[~(np.isfinite(depth) & (depth > 0))] = 0
+        if not depth.any():
+            raise InputError(
+                f"{path}: the depth map is zero everywhere; remove it or its frame, or estimate "
+                "depth (depth=stereo)"
+            )
+        return torch.from_numpy(depth)
 
 
 def _read_npy(path: Path, size: tuple[int, int]) -> Shaped[np.ndarray, "h w"]:

@@ -5,14 +5,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from complaints import complaint_about
 from PIL import Image
 
-from extrap_train.data.depth_files import read_depth, read_sixteen_bit
+from extrap_train.data.depth_files import DepthFile
 from extrap_train.data.image_files import same_view
 
 _RNG = np.random.default_rng(0)
 _DEPTH = _RNG.integers(1, 60_000, (6, 8)).astype(np.uint16)
+
+
+def read_depth(path: Path, size: tuple[int, int], scale: float = 1.0) -> torch.Tensor:
+    return DepthFile(path.name, scale).read(path.parent, size)
 
 
 def _save_depth(path: Path, raw: np.ndarray) -> Path:
@@ -38,7 +43,7 @@ def test_depth_of_fewer_pixels_is_that_of_the_nearest(tmp_path, name, kind, time
 def test_depth_of_more_pixels_is_sampled(tmp_path):
     large = np.kron(_DEPTH, np.ones((3, 3), np.uint16))
     path = _save_depth(tmp_path / "d.png", large)
-    assert np.array_equal(read_sixteen_bit(path, (6, 8)), _DEPTH)
+    assert np.array_equal(read_depth(path, (6, 8)), _DEPTH)
 
 
 def test_depth_of_another_shape_is_refused_with_both_sizes(tmp_path):

@@ -18,10 +18,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from benchmarks.protocol.array_files import array_of, pictures_of
-from extrap_train.data.depth_files import read_depth, read_sixteen_bit
+from extrap_train.data.depth_files import DepthFile
 from extrap_train.data.image_files import (
     image_size,
     read_grey,
@@ -36,6 +37,14 @@ MOST_SECONDS = 20.0
 MOST_MIB = 4096
 SIZE = (24, 32)
 PROGRAMS = ("subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "os.fork", "pickle.")
+
+
+def read_depth(path: Path, size: tuple[int, int], scale: float = 1.0) -> torch.Tensor:
+    return DepthFile(path.name, scale).read(path.parent, size)
+
+
+def read_half_depth(path: Path, size: tuple[int, int]) -> torch.Tensor:
+    return DepthFile(path.name, 1.0, is_half_float=True).read(path.parent, size)
 
 
 def _png_chunk(kind: bytes, data: bytes) -> bytes:
@@ -200,7 +209,7 @@ def _readings(path: Path) -> Iterator[Callable[[], object]]:
     yield lambda: read_photograph(path, SIZE, path)
     yield lambda: read_mask(path, SIZE)
     yield lambda: read_grey(path, of_its_size())
-    yield lambda: read_sixteen_bit(path, of_its_size())
+    yield lambda: read_half_depth(path, of_its_size())
     yield lambda: read_depth(path, SIZE, 0.001)
     if path.is_file() and not path.is_symlink():
         content = path.read_bytes()

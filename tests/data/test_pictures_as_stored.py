@@ -12,7 +12,7 @@ from complaints import complaint_about
 from PIL import Image
 
 from extrap_train.data import image_files
-from extrap_train.data.depth_files import read_depth, read_sixteen_bit
+from extrap_train.data.depth_files import DepthFile
 from extrap_train.data.image_files import (
     FORMATS,
     image_size,
@@ -52,6 +52,14 @@ _QUARTER_TURNS = (5, 6, 7, 8)
 
 def read_image(path: Path, size: tuple[int, int]) -> torch.Tensor:
     return read_photograph(path, size)[0]
+
+
+def read_depth(path: Path, size: tuple[int, int], scale: float = 1.0) -> torch.Tensor:
+    return DepthFile(path.name, scale).read(path.parent, size)
+
+
+def read_half_depth(path: Path, size: tuple[int, int]) -> torch.Tensor:
+    return DepthFile(path.name, 1.0, is_half_float=True).read(path.parent, size)
 
 
 def save_with_tag(path: Path, pixels: np.ndarray, tag: int) -> Path:
@@ -251,7 +259,7 @@ def test_no_program_is_started_for_postscript(tmp_path, monkeypatch):
     Image.new("RGB", (8, 8)).save(content, "EPS")
     for name in ("photo.png", "mask.jpg", "depth.tif", "postscript.eps"):
         (tmp_path / name).write_bytes(content.getvalue())
-        for read in (read_image, read_mask, read_sixteen_bit):
+        for read in (read_image, read_mask, read_half_depth):
             complaint_about(read, tmp_path / name, (8, 8))
         complaint_about(image_size, tmp_path / name)
         complaint_about(read_depth, tmp_path / name, (8, 8), 1.0)
