@@ -11,12 +11,12 @@ from extrap_train.store.manifest import MANIFEST, Manifest, Split
 from extrap_train.store.records import write_record, write_summary
 
 
-def finished_run(folder: Path) -> RunFolder:
-    """Trained on one rendered capture from somebody's weights, which lay in the same folder."""
+def finished_run(folder: Path, start: Path | None = None, capture: str = "0001") -> RunFolder:
+    """Trained on one rendered capture, by default from somebody's weights in the same folder."""
     run = RunFolder(folder / "run")
     unet = UNetConfig([16, 32], 1, [False, True], 2, 16, 16)
-    start = str(folder / "zeronvs.ckpt")
-    save_model(ExtrapolationModel(ModelConfig("small", unet=unet, start=start)), run.model)
+    began = str(start or folder / "zeronvs.ckpt")
+    save_model(ExtrapolationModel(ModelConfig("small", unet=unet, start=began)), run.model)
     (run.model / "pickle.bin").write_bytes(b"\x80")
     scores = {"model": {"psnr": 24.0, "lpips": None}, "nearest": {"psnr": 15.5, "lpips": None}}
     summary = {
@@ -26,6 +26,6 @@ def finished_run(folder: Path) -> RunFolder:
         "model_sha256": folder_digest(run.model),
     }
     write_summary(run.path, summary)
-    split = {"hydrant": Split("synthetic", ("0001",), ("0000",))}
-    write_record(run.path / MANIFEST, Manifest.of({"model.start": start}, {}, split))
+    split = {"hydrant": Split("synthetic", (capture,), ("0000",))}
+    write_record(run.path / MANIFEST, Manifest.of({"model.start": began}, {}, split))
     return run

@@ -1,13 +1,14 @@
 """`task=push`: a trained model on the Hugging Face hub, with a card that says what it is."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from huggingface_hub import CommitOperationAdd, HfApi
 
-from extrap_train.config import MODEL_CONFIG, TrainConfig, packaged_names
+from extrap_train.config import MODEL_CONFIG, PACKAGED_MODELS, TrainConfig, packaged_names
 from extrap_train.diffusion.hub import (
     FILES,
     HUB_FAILURES,
@@ -15,10 +16,11 @@ from extrap_train.diffusion.hub import (
     is_repository,
     weights_folder,
 )
+from extrap_train.diffusion.leakage import trainings_of
 from extrap_train.diffusion.model_files import is_own, load_model, saved_config
 from extrap_train.errors import InputError
 from extrap_train.runs import RunFolder, existing_run
-from extrap_train.store.manifest import MANIFEST, read_manifest
+from extrap_train.store.manifest import MANIFEST, Split, read_manifest
 from extrap_train.tasks.model_card import model_card
 from extrap_train.tasks.scene_model import UsedWeights
 from extrap_train.terminal import terminal
@@ -62,8 +64,29 @@ def _records(folder: Path) -> dict[str, bytes]:
         model = replace(model, start=f"local:{Path(str(start)).name}")
     records: dict[str, Any] = {MODEL_CONFIG: model}
     if (beside / MANIFEST).is_file():
-        records[MANIFEST] = replace(read_manifest(beside), options={})
+        manifest = replace(read_manifest(beside), options={})
+        if model.start != start:  # whoever downloads it cannot follow the start
+            manifest = replace(manifest, split=_all_seen(folder, manifest.split))
+        records[MANIFEST] = manifest
     return {name: json.dumps(asdict(x), indent=1).encode() for name, x in records.items()}
+
+
+def _all_seen(folder: Path, split: Mapping[str, Split]) -> dict[str, Split]:
+    """A run's captures with those that its starts were trained on, as far as one split a category
+    can say.
+    """
+    seen = dict(split)
+    for training in trainings_of(str(folder)):
+        own = seen.setdefault(training.category, replace(training.split, test=()))
+        if (own.source, own.seed) == (training.split.source, training.split.seed):
+            train = tuple(sorted({*own.train, *training.split.train}))
+            seen[training.category] = replace(own, train=train)
+        else:
+            terminal(stderr=True).print(
+                f"{training.model}: its captures of {training.category} are of another source or "
+                "seed and are not in the manifest; say so on the card"
+            )
+    return seen
 
 
 def _model_folder(config: TrainConfig) -> Path:
@@ -85,4 +108,4 @@ def _model_folder(config: TrainConfig) -> Path:
 
 def _name(folder: Path) -> str:
     """A packaged model's own, whose length of training is known by it."""
-    return folder.name if folder.name in packaged_names() else str(folder)
+    return folder.name if folder.parent == PACKAGED_MODELS else str(folder)

@@ -89,6 +89,20 @@ def _check_card(text: str) -> None:
         assert said in card.text
 
 
+def test_the_manifest_that_is_pushed_has_what_local_starts_have_seen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = finished_run(tmp_path / "first")
+    second = finished_run(tmp_path / "second", start=first.model, capture="0002")
+    with serve_hub() as hub:
+        monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", hub.address)
+        words = ["task=push", "category=hydrant", f"weights={second.model}", "repo=me/second"]
+        run_command(main, *words)
+    (files,) = hub.commits["me/second"].values()
+    assert json.loads(files["extrapolation_model.json"])["start"] == "local:model"
+    assert json.loads(files["manifest.json"])["split"]["hydrant"]["train"] == ["0001", "0002"]
+
+
 @pytest.fixture
 def downloaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder that `me/downloaded` is cached in, with its run's manifest within."""
