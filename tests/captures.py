@@ -3,6 +3,7 @@
 import copy
 import gzip
 import json
+import tempfile
 from functools import cache
 from pathlib import Path
 
@@ -38,6 +39,21 @@ def write_capture(
     step_deg: float = 30,
 ) -> None:
     """Category `cup` with sequences of a few frames; the frame numbers are 1, 11, 21, …"""
+    for path, content in _written(names, frames, size, step_deg).items():
+        (root / path).parent.mkdir(parents=True, exist_ok=True)
+        (root / path).write_bytes(content)
+
+
+@cache
+def _written(names: tuple[str, ...], frames: int, size: int, step_deg: float) -> dict[Path, bytes]:
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        _write(root, names, frames, size, step_deg)
+        files = [path for path in root.rglob("*") if path.is_file()]
+        return {path.relative_to(root): path.read_bytes() for path in files}
+
+
+def _write(root: Path, names: tuple[str, ...], frames: int, size: int, step_deg: float) -> None:
     entries = [
         # Written backwards: the reader is to sort.
         write_frame(root, "cup", name, 10 * index + 1, view_at(step_deg * index, size))
