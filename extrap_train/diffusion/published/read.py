@@ -7,14 +7,8 @@ import torch
 from torch import Tensor
 
 from extrap_train.config import ModelConfig
-from extrap_train.diffusion.published.names import (
-    CLIP_PREFIX,
-    PROJECTION_PREFIX,
-    UNET_PREFIX,
-    VAE_PREFIX,
-    origins,
-)
-from extrap_train.weight_files import WeightFile
+from extrap_train.diffusion.published.names import PREFIXES, clip_origin, renamed
+from extrap_train.weight_files import DAMAGE, WeightFile
 
 SOURCES = (
     "ZeroNVS's .ckpt (https://huggingface.co/kylesargent/ZeroNVS), MegaScenes's iter_N folder "
@@ -34,10 +28,10 @@ _LIGHTNING_REMARKS = (
 """What the Lightning of those years wrote beside the tensors; read as inert remarks."""
 
 _CONTENT = {
-    UNET_PREFIX: "the denoiser",
-    VAE_PREFIX: "the autoencoder",
-    CLIP_PREFIX: "CLIP's image tower",
-    PROJECTION_PREFIX: "the projection of pose and image",
+    "unet": "the denoiser",
+    "vae": "the autoencoder",
+    "image_encoder": "CLIP's image tower",
+    "cc_projection": "the projection of pose and image",
 }
 _FOLDER_FILES = {
     "unet": ("diffusion_pytorch_model",),
@@ -98,21 +92,27 @@ def _from_latent_diffusion(
 ) -> dict[str, dict[str, Tensor]]:
     if all(name.startswith("module.") for name in state):  # saved from inside DDP
         state = {name.removeprefix("module."): x for name, x in state.items()}
-    places = {part: origins(part, list(shapes), config) for part, shapes in wanted.items()}
-    names = list(dict.fromkeys(o.name for place in places.values() for o in place.values()))
-    missing = [name for name in names if name not in state]
-    if missing:
-        raise file.refusal(_listed(missing, len(names), _cause(state)))
-    strange = [n for n in state if n.startswith(tuple(_CONTENT)) and n not in set(names)]
-    if strange:
-        raise file.refusal(
-            f"holds {len(strange)} tensors more than this network ({_first(strange)}): "
-            "it is of another size than model.unet, model.vae and model.clip say"
-        )
-    return {
-        part: {name: place.made_by(state[place.name]) for name, place in by_name.items()}
-        for part, by_name in places.items()
+    for part, names in wanted.items():
+        expected = {clip_origin(name)[0] for name in names} if part == "image_encoder" else names
+        surplus = sum(name.startswith(PREFIXES[part]) for name in state) - len(expected)
+        if surplus > 0:
+            raise file.refusal(
+                f"holds {surplus} tensors more of {_CONTENT[part]} than this network: it is of "
+                "another size than model.unet, model.vae and model.clip say"
+            )
+    try:
+        parts = {part: renamed(part, state, names, config) for part, names in wanted.items()}
+    except DAMAGE:  # of names that no such network has
+        raise file.refusal(_cause(state)) from None
+    found = {
+        part: {name: parts[part][name] for name in names if name in parts[part]}
+        for part, names in wanted.items()
     }
+    missing = [f"{part}.{n}" for part in wanted for n in wanted[part] if n not in found[part]]
+    if missing:
+        total = sum(map(len, wanted.values()))
+        raise file.refusal(_listed(missing, total, _cause(state)))
+    return found
 
 
 def _cause(state: Mapping[str, Tensor]) -> str:
@@ -121,8 +121,8 @@ def _cause(state: Mapping[str, Tensor]) -> str:
         return "it is a text-to-image Stable Diffusion, not a model of this family"
     gone = [
         what
-        for prefix, what in _CONTENT.items()
-        if not any(name.startswith(prefix) for name in state)
+        for part, what in _CONTENT.items()
+        if not any(name.startswith(PREFIXES[part]) for name in state)
     ]
     if len(gone) == len(_CONTENT):
         return "its names are not those of a latent-diffusion checkpoint"

@@ -123,7 +123,7 @@ def test_missing_tensors_are_counted_and_the_first_five_named(
     torch.save({k: x for k, x in state.items() if k not in gone}, tmp_path / "zeronvs.ckpt")
     message = _refusal(_config(tmp_path / "zeronvs.ckpt"))
     assert f"lacks {len(gone)} of " in message
-    assert sum(name in message for name in gone) == 5
+    assert message.count("unet.mid_block.") == 5
     assert "of another size" in message
 
 
