@@ -11,9 +11,9 @@ from extrap_train.config import CompletionConfig
 from extrap_train.depth import DepthSource
 from extrap_train.diffusion.generator import ViewGenerator
 from extrap_train.geometry.cameras import unproject
-from extrap_train.reconstruction.depth_completion.inference import DepthCompletion
+from extrap_train.reconstruction.depth_prediction.inference import DepthPredictor
 from extrap_train.reconstruction.global_map import GENERATED, GIVEN, GlobalMap, MapView, Origin
-from extrap_train.reconstruction.new_view import Proposal, propose, propose_completed
+from extrap_train.reconstruction.new_view import Proposal, propose, propose_predicted
 from extrap_train.reconstruction.planner import REFERENCES, Query, next_query
 from extrap_train.reconstruction.prior import prior_of
 from extrap_train.views import Camera, View, stack_cameras
@@ -45,8 +45,8 @@ class CompletionPipeline:
     """Measures the generated views' depth."""
     options: CompletionConfig
     seed: int
-    completion: DepthCompletion | None = None
-    """Predicts the generated views' depth, in place of `source`."""
+    predictor: DepthPredictor | None = None
+    """Predicts the generated views' depth instead of `source`."""
 
 
 def map_of_inputs(
@@ -94,13 +94,13 @@ def add_view(
     best: tuple[Proposal, int] | None = None
     attempts = 0
     for seed in range(pipeline.seed, pipeline.seed + tries):
-        picture = _picture(known, query, references, pipeline.generator, seed)
+        picture = _generate_picture(known, query, references, pipeline.generator, seed)
         clock.took("generate")
-        if pipeline.completion is None:
+        if pipeline.predictor is None:
             proposal = propose(known, picture, neighbours, pipeline.source, options.confidence)
         else:
-            proposal = propose_completed(
-                known, picture, neighbours, pipeline.completion, options.confidence
+            proposal = propose_predicted(
+                known, picture, neighbours, pipeline.predictor, options.confidence
             )
         clock.took("align")
         attempts += 1
@@ -153,7 +153,7 @@ def loop_error(known: GlobalMap, camera: Camera, neighbours: Sequence[int]) -> f
     return float(apart[both].median())
 
 
-def _picture(
+def _generate_picture(
     known: GlobalMap,
     query: Query,
     references: Sequence[int],

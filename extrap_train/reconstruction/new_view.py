@@ -4,6 +4,7 @@ where nothing measures it.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,7 +16,7 @@ from extrap_train.geometry.cameras import unproject_to_world
 from extrap_train.geometry.ncc import ncc_consistent
 from extrap_train.reconstruction.agreement import Sight, look_up
 from extrap_train.reconstruction.continuation import continued_depth
-from extrap_train.reconstruction.depth_completion.inference import DepthCompletion
+from extrap_train.reconstruction.depth_prediction.inference import DepthPredictor
 from extrap_train.reconstruction.global_map import MOST_COMPARED, GlobalMap
 from extrap_train.reconstruction.measurement import (
     Measured,
@@ -28,9 +29,9 @@ from extrap_train.reconstruction.prior import Prior, prior_of
 from extrap_train.views import Camera, View
 
 CONTINUED_CONFIDENCE = 0.15
-"""Of depth that nothing measures."""
-COMPLETED_CONFIDENCE = 0.7
-"""Most of depth that was completed: less than what stereo measures."""
+"""Confidence of depth that nothing measures."""
+PREDICTED_CONFIDENCE = 0.7
+"""Highest confidence of predicted depth: below what stereo measures."""
 CONTRADICTED = 0.9
 """Factor on the confidence of a pixel whose two depths differ."""
 AS_SURE = 1e-3
@@ -68,57 +69,62 @@ def propose(
     agreement = _agreement(picture, prior, measured, known.tolerance)
     if options.support:
         measured = supported(measured, prior, len(indices), known.tolerance)
-    kept = _contradicted(known, picture.camera, prior, measured) if options.repair else None
-    depth, confidence = _fused(prior, measured, known.tolerance, kept)
-    unbacked = (depth > 0) & ~prior.mask
-    if options.reject and agreement < options.least_agreement:
-        depth, confidence = (torch.where(unbacked, 0, x) for x in (depth, confidence))
-    elif options.free_space:
-        seen_through = _seen_through(known, depth, confidence, picture.camera)
-        depth, confidence = (
-            torch.where(unbacked & seen_through, 0, x) for x in (depth, confidence)
-        )
-    completed = continued_depth(depth, picture.image)
-    continued = (depth == 0) & (completed > 0)
+    contradicted = _contradicted(known, picture.camera, prior, measured) if options.repair else None
+    depth, confidence = _fused(prior, measured, known.tolerance, contradicted)
+    distrust = partial(_distrusted, known, picture.camera, agreement, options)
+    dropped = (depth > 0) & ~prior.mask & distrust(depth, confidence)
+    depth, confidence = (torch.where(dropped, 0, x) for x in (depth, confidence))
+    filled = continued_depth(depth, picture.image)
+    continued = (depth == 0) & (filled > 0)
     confidence = torch.where(continued, CONTINUED_CONFIDENCE, confidence)
-    if options.reject and agreement < options.least_agreement:
-        confidence = torch.where(continued, 0, confidence)
-    elif options.free_space:
-        seen_through = _seen_through(known, completed, confidence, picture.camera)
-        confidence = torch.where(continued & seen_through, 0, confidence)
-    completed = torch.where(confidence > 0, completed, 0)
-    view = replace(picture, depth=completed)
+    confidence = torch.where(continued & distrust(filled, confidence), 0, confidence)
+    view = replace(picture, depth=torch.where(confidence > 0, filled, 0))
     return Proposal(view, confidence, agreement, measured.usable_edges)
 
 
-def propose_completed(
+def propose_predicted(
     known: GlobalMap,
     picture: View,
     indices: Sequence[int],
-    completion: DepthCompletion,
+    predictor: DepthPredictor,
     options: ConfidenceConfig,
 ) -> Proposal:
-    """Give a picture, posed and without depth, its completed depth.
+    """Give a picture, posed and without depth, its predicted depth.
 
-    Where the map is certain its depth stays; elsewhere the completed one enters, as sure as it says
-    and less sure than any photograph. What the map shows only through unobserved space neither
-    confirms the view nor contradicts it.
+    Where the map is certain, its depth is kept. Elsewhere the predicted depth enters with its own
+    confidence, scaled to stay below a photograph's. What the map shows only through unobserved
+    space neither confirms the view nor contradicts it.
     """
     prior = prior_of(known, picture.camera, indices)
-    found = completion(known, picture, indices)
+    found = predictor(known, picture, indices)
     certain = found.certain & prior.mask
     agrees, testable = ncc_consistent(picture.image, prior.image, certain)
     agreement = float(agrees.sum() / testable.sum()) if testable.any() else 0.0
     depth = torch.where(certain, prior.depth, found.depth)
-    confidence = torch.where(certain, prior.confidence, COMPLETED_CONFIDENCE * found.confidence)
+    confidence = torch.where(certain, prior.confidence, PREDICTED_CONFIDENCE * found.confidence)
     confidence = torch.where(depth > 0, confidence, 0)
-    if options.reject and agreement < options.least_agreement:
-        confidence = torch.where(certain, confidence, 0)
-    elif options.free_space:
-        seen_through = _seen_through(known, depth, confidence, picture.camera)
-        confidence = torch.where(~certain & seen_through, 0, confidence)
+    distrusted = _distrusted(known, picture.camera, agreement, options, depth, confidence)
+    confidence = torch.where(~certain & distrusted, 0, confidence)
     depth = torch.where(confidence > 0, depth, 0)
     return Proposal(replace(picture, depth=depth), confidence, agreement, len(indices))
+
+
+def _distrusted(
+    known: GlobalMap,
+    camera: Camera,
+    agreement: float,
+    options: ConfidenceConfig,
+    depth: Float[Tensor, "h w"],
+    confidence: Float[Tensor, "h w"],
+) -> Bool[Tensor, "h w"]:
+    """Pixels that need the map's backing: all of a view that contradicts the map, and of any other
+    view those in space that a more certain view has seen to be empty.
+    """
+    if options.reject and agreement < options.least_agreement:
+        return torch.ones_like(depth, dtype=torch.bool)
+    if options.free_space:
+        return _seen_through(known, depth, confidence, camera)
+    return torch.zeros_like(depth, dtype=torch.bool)
 
 
 def _agreement(picture: View, prior: Prior, measured: Measured, tolerance: float) -> float:

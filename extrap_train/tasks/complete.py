@@ -28,8 +28,8 @@ from extrap_train.errors import InputError
 from extrap_train.geometry.world_frame import WorldFrame
 from extrap_train.reconstruction.cloud_pictures import draw_plan
 from extrap_train.reconstruction.completion import CompletionPipeline, Step, complete, map_of_inputs
-from extrap_train.reconstruction.depth_completion.inference import NetworkCompletion
-from extrap_train.reconstruction.depth_completion.network import load_depth_network
+from extrap_train.reconstruction.depth_prediction.inference import NetworkDepth
+from extrap_train.reconstruction.depth_prediction.network import load_depth_network
 from extrap_train.reconstruction.exact import ExactDepth, ExactGenerator
 from extrap_train.reconstruction.fusion import fuse_depths
 from extrap_train.reconstruction.global_map import GlobalMap, MapView
@@ -120,7 +120,7 @@ class _Job:
 
 def run(config: TrainConfig) -> Outcome:
     """Complete a scene; a second run resumes after the last whole view, or says that it is done."""
-    job = _job(config)
+    job = _open_job(config)
     console = terminal()
     manifest = scene_manifest(config, job.photographs, job.weights, _map_options(config))
     with claim(job.folder, manifest, resume=config.resume) as result:
@@ -129,7 +129,7 @@ def run(config: TrainConfig) -> Outcome:
         return Outcome(job.folder, _run(job, console))
 
 
-def _job(config: TrainConfig) -> _Job:
+def _open_job(config: TrainConfig) -> _Job:
     scene = required_scene(config)
     options = config.data if isinstance(config.data, SyntheticConfig) else SyntheticConfig()
     sequence = open_scene(scene, options)
@@ -184,7 +184,7 @@ def _check_category(config: TrainConfig, sequence: FrameSequence) -> None:
 def _run(job: _Job, console: Console) -> bool:
     """Whether every view was there already."""
     pipeline = _pipeline(job)
-    known = _started_map(job, pipeline, console)
+    known = _start_map(job, pipeline, console)
     queries = _queries(job, known)
     # The same plan for a run that resumes.
     start = replace(known, views=known.views[: len(job.inputs)])
@@ -198,7 +198,7 @@ def _run(job: _Job, console: Console) -> bool:
     require_space(job.folder, missing * view_bytes(pipeline.generator.warp_size))
     with _viewer(job, known, console) as viewer:
         with advise_on_sampling_memory(1, job.config.trainer):
-            known = _completed(job, known, queries, pipeline, viewer)
+            known = _complete_map(job, known, queries, pipeline, viewer)
         steps = load_steps(job.folder / "map", len(known))
         seconds = {
             "inputs": load_input_seconds(job.folder / "map"),
@@ -230,13 +230,13 @@ def _pipeline(job: _Job) -> CompletionPipeline:
     # A generated view brings no depth along.
     own = config.depth
     source = depth_source(StereoConfig() if isinstance(own, DatasetDepthConfig) else own)
-    completion = None
+    predictor = None
     if job.depth_network is not None:
-        completion = NetworkCompletion(load_depth_network(job.depth_network), source)
-    return CompletionPipeline(generator, source, config.complete, config.seed, completion)
+        predictor = NetworkDepth(load_depth_network(job.depth_network), source)
+    return CompletionPipeline(generator, source, config.complete, config.seed, predictor)
 
 
-def _started_map(job: _Job, pipeline: CompletionPipeline, console: Console) -> GlobalMap:
+def _start_map(job: _Job, pipeline: CompletionPipeline, console: Console) -> GlobalMap:
     """What an earlier run left, or the inputs, measured and saved."""
     folder = job.folder / "map"
     known = load_map(folder, job.config.complete.tolerance)
@@ -306,7 +306,7 @@ def _viewer(job: _Job, known: GlobalMap, console: Console) -> Iterator[CloudView
             input("the scene is complete and written; Enter closes the viewer ")
 
 
-def _completed(
+def _complete_map(
     job: _Job,
     known: GlobalMap,
     queries: list[Query],

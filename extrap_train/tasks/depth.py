@@ -23,10 +23,10 @@ from extrap_train.depth.sources import depth_source
 from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.diffusion.packaged import packaged_name
 from extrap_train.errors import InputError
-from extrap_train.reconstruction.depth_completion.calibration import DepthScores, calibrate
-from extrap_train.reconstruction.depth_completion.examples import draw_examples
-from extrap_train.reconstruction.depth_completion.network import save_depth_network
-from extrap_train.reconstruction.depth_completion.network_training import (
+from extrap_train.reconstruction.depth_prediction.calibration import DepthScores, calibrate
+from extrap_train.reconstruction.depth_prediction.examples import draw_examples
+from extrap_train.reconstruction.depth_prediction.network import save_depth_network
+from extrap_train.reconstruction.depth_prediction.network_training import (
     DepthTraining,
     StoredExamples,
     save_examples,

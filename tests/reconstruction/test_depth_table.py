@@ -25,9 +25,9 @@ from extrap_train.geometry.viewpoints import directions_from, scene_center
 from extrap_train.geometry.world_frame import WorldFrame
 from extrap_train.reconstruction.cloud import cloud_of
 from extrap_train.reconstruction.completion import CompletionPipeline, complete, map_of_inputs
-from extrap_train.reconstruction.depth_completion.inference import (
-    CompletedDepth,
-    DepthCompletion,
+from extrap_train.reconstruction.depth_prediction.inference import (
+    DepthPredictor,
+    PredictedDepth,
 )
 from extrap_train.reconstruction.exact import ExactDepth
 from extrap_train.reconstruction.fusion import fuse_depths
@@ -80,11 +80,11 @@ class Capture:
         return render(self.scene, self.world.outside(view.camera)).image
 
     def completed(
-        self, completion: DepthCompletion | None, references: str = "photographs"
+        self, predictor: DepthPredictor | None, references: str = "photographs"
     ) -> GlobalMap:
         options = CompletionConfig(references=references)
         stereo = PlaneSweepStereo(StereoConfig())
-        pipeline = CompletionPipeline(self.generator, stereo, options, 0, completion)
+        pipeline = CompletionPipeline(self.generator, stereo, options, 0, predictor)
         queries = orbit_queries(self.inputs.cameras, np.radians(30))
         return complete(self.inputs, queries, pipeline, lambda *_: None)
 
@@ -95,15 +95,15 @@ class Capture:
 
 
 @dataclass(frozen=True)
-class ExactCompletion:
+class ExactPredictor:
     """The oracle: true depth, whatever the picture shows."""
 
     capture: Capture
 
-    def __call__(self, known: GlobalMap, picture: View, indices: Sequence[int]) -> CompletedDepth:
+    def __call__(self, known: GlobalMap, picture: View, indices: Sequence[int]) -> PredictedDepth:
         depth, _ = self.capture.truth(picture)
         prior = prior_of(known, picture.camera, indices)
-        return CompletedDepth(depth, (depth > 0).float(), (prior.depth / depth - 1).abs() < WITHIN)
+        return PredictedDepth(depth, (depth > 0).float(), (prior.depth / depth - 1).abs() < WITHIN)
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ def test_what_exact_depth_at_birth_is_worth(is_exact: bool) -> None:
     for category in CATEGORIES:
         for number in NUMBERS:
             capture = Capture.open(category, number)
-            known = capture.completed(ExactCompletion(capture) if is_exact else None)
+            known = capture.completed(ExactPredictor(capture) if is_exact else None)
             found = capture.scores(known)
             rows.append([found[name] for name in ("accuracy", "completeness", "f_score")])
             errors += [(x.angle_deg, x.errors()) for x in generated_views(capture, known)]

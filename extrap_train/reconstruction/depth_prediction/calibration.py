@@ -7,12 +7,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from extrap_train.reconstruction.depth_completion.network import (
+from extrap_train.reconstruction.depth_prediction.network import (
     CONFIDENT_WITHIN,
     DepthMixture,
     DepthNetwork,
 )
-from extrap_train.reconstruction.depth_completion.observation import CERTAIN, CHANNELS
+from extrap_train.reconstruction.depth_prediction.observation import CERTAIN, CHANNELS
 
 BINS = 10
 _FACTORS = 2.0 ** torch.arange(-2, 3.01, 0.25)

@@ -15,9 +15,9 @@ from extrap_train.diffusion.averaging import AveragedModule
 from extrap_train.diffusion.checkpoints import WholeCheckpointIO, find_damage
 from extrap_train.diffusion.training import rate_at
 from extrap_train.errors import InputError
-from extrap_train.reconstruction.depth_completion.examples import DepthExamples
-from extrap_train.reconstruction.depth_completion.network import WIDTHS, DepthMixture, DepthNetwork
-from extrap_train.reconstruction.depth_completion.observation import CHANNELS
+from extrap_train.reconstruction.depth_prediction.examples import DepthExamples
+from extrap_train.reconstruction.depth_prediction.network import WIDTHS, DepthMixture, DepthNetwork
+from extrap_train.reconstruction.depth_prediction.observation import CHANNELS
 from extrap_train.store.atomic import atomic_file, save_array
 
 LEARNING_RATE = 1e-3

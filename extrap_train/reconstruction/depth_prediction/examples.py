@@ -1,5 +1,5 @@
-"""Training examples of the depth network: what completion itself comes to, on captures whose depth
-is known.
+"""Training examples of the depth network: the views that completion generates, from captures of
+known depth.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,8 +18,8 @@ from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.diffusion.generator import ViewGenerator
 from extrap_train.geometry.world_frame import WorldFrame
 from extrap_train.reconstruction.completion import CompletionPipeline, complete, map_of_inputs
-from extrap_train.reconstruction.depth_completion.inference import CompletedDepth, observe_in_map
-from extrap_train.reconstruction.depth_completion.observation import Observation
+from extrap_train.reconstruction.depth_prediction.inference import PredictedDepth, observe_in_map
+from extrap_train.reconstruction.depth_prediction.observation import Observation
 from extrap_train.reconstruction.global_map import GENERATED, GlobalMap
 from extrap_train.reconstruction.inputs import choose_frames, first_views, fit_world_frame
 from extrap_train.reconstruction.planner import orbit_queries
@@ -84,7 +84,7 @@ def draw_examples(
 
 @dataclass(frozen=True)
 class _Recorder:
-    """A `DepthCompletion` that knows the truth and spoils it."""
+    """A `DepthPredictor` that knows the truth and spoils it."""
 
     truth: Truth
     world: WorldFrame
@@ -93,7 +93,7 @@ class _Recorder:
     rng: np.random.Generator
     examples: list[DepthExamples] = field(default_factory=list)
 
-    def __call__(self, known: GlobalMap, picture: View, indices: Sequence[int]) -> CompletedDepth:
+    def __call__(self, known: GlobalMap, picture: View, indices: Sequence[int]) -> PredictedDepth:
         seen = observe_in_map(known, picture, indices, self.source)
         camera = picture.camera.resized(*seen.certain.shape[-2:])
         depth, mask = self.truth(self.world.outside(camera))
@@ -103,7 +103,7 @@ class _Recorder:
         confidence = (1 - error.abs() / 0.04).clamp(0.1, 0.9)
         certain = seen.certain[0]
         spoiled = depth * (1 + torch.where(certain, 0, error))
-        completed = CompletedDepth(spoiled, confidence, certain)
+        completed = PredictedDepth(spoiled, confidence, certain)
         return completed.resized(picture.camera.height, picture.camera.width)
 
 

@@ -13,31 +13,31 @@ from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError
 from extrap_train.geometry.visibility import Ball
 from extrap_train.reconstruction.completion import CompletionPipeline, add_view, map_of_inputs
-from extrap_train.reconstruction.depth_completion.calibration import calibrate
-from extrap_train.reconstruction.depth_completion.examples import (
+from extrap_train.reconstruction.depth_prediction.calibration import calibrate
+from extrap_train.reconstruction.depth_prediction.examples import (
     DepthExamples,
     draw_examples,
     with_truth,
 )
-from extrap_train.reconstruction.depth_completion.inference import (
-    CompletedDepth,
-    NetworkCompletion,
+from extrap_train.reconstruction.depth_prediction.inference import (
+    NetworkDepth,
+    PredictedDepth,
     fit_to_known,
 )
-from extrap_train.reconstruction.depth_completion.network import (
+from extrap_train.reconstruction.depth_prediction.network import (
     CONFIDENT_WITHIN,
     DepthMixture,
     DepthNetwork,
     load_depth_network,
     save_depth_network,
 )
-from extrap_train.reconstruction.depth_completion.network_training import (
+from extrap_train.reconstruction.depth_prediction.network_training import (
     DepthTraining,
     StoredExamples,
     loss_of,
     save_examples,
 )
-from extrap_train.reconstruction.depth_completion.observation import (
+from extrap_train.reconstruction.depth_prediction.observation import (
     CERTAIN,
     CHANNELS,
     ENTRY,
@@ -253,10 +253,10 @@ class ExactGenerator:
         return Made(torch.stack([BALL.image(queries[i]) for i in range(len(names))]))
 
 
-def exact(known, picture, indices) -> CompletedDepth:
+def exact(known, picture, indices) -> PredictedDepth:
     depth = BALL.depth(picture.camera)
     shown = prior_of(known, picture.camera, indices).depth
-    return CompletedDepth(depth, (depth > 0).float(), (shown / depth - 1).abs() < 0.02)
+    return PredictedDepth(depth, (depth > 0).float(), (shown / depth - 1).abs() < 0.02)
 
 
 def test_a_view_enters_with_the_completed_depth_where_the_map_is_not_certain():
@@ -277,7 +277,7 @@ def test_the_network_keeps_what_the_map_is_certain_of():
     views = [replace(view, mask=None) for view in front()]
     known = map_of_inputs(views, [(view.depth > 0).float() for view in views], 0.01)
     picture = replace(photograph(40.0), depth=None, mask=None)
-    found = NetworkCompletion(DepthNetwork().eval(), DatasetDepth())(known, picture, [0, 1, 2])
+    found = NetworkDepth(DepthNetwork().eval(), DatasetDepth())(known, picture, [0, 1, 2])
     off = (found.depth / BALL.depth(picture.camera) - 1).abs()
     assert found.certain.float().mean() > 0.3
     assert (off[found.certain] < 0.03).float().mean() > 0.95

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from extrap_train.reconstruction.depth_completion.observation import CHANNELS, ENTRY, MEASURED
+from extrap_train.reconstruction.depth_prediction.observation import CHANNELS, ENTRY, MEASURED
 from extrap_train.weight_files import WeightFile, write_tensors
 
 PATCH = 4

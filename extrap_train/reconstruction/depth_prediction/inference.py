@@ -13,8 +13,8 @@ from torch.nn import functional
 from extrap_train.depth import DepthSource
 from extrap_train.geometry.visibility import Ball
 from extrap_train.reconstruction.continuation import extend_harmonically, neighbour_ties
-from extrap_train.reconstruction.depth_completion.network import DepthNetwork
-from extrap_train.reconstruction.depth_completion.observation import Observation, observe
+from extrap_train.reconstruction.depth_prediction.network import DepthNetwork
+from extrap_train.reconstruction.depth_prediction.observation import Observation, observe
 from extrap_train.reconstruction.global_map import GlobalMap
 from extrap_train.reconstruction.measurement import measure
 from extrap_train.views import View, resample_surfaces, stack_cameras
@@ -24,13 +24,13 @@ WORKING_SIZE = 128
 EDGE = 0.03
 """Difference of log depth between neighbours that are two surfaces."""
 LEAK = 1e-3
-"""Of the correction at the rim, which fades over about 1/sqrt(LEAK) pixels."""
+"""How fast the correction at the rim fades: over about 1/sqrt(LEAK) pixels."""
 LARGEST_CORRECTION = 0.1
-"""Difference of log depth at the rim beyond which the network means another surface."""
+"""Difference of log depth at the rim above which the network shows another surface."""
 
 
 @dataclass(frozen=True)
-class CompletedDepth:
+class PredictedDepth:
     """A view's dense depth before it enters the map."""
 
     depth: Float[Tensor, "h w"]
@@ -39,25 +39,25 @@ class CompletedDepth:
     certain: Bool[Tensor, "h w"]
     """Where the map shows a surface through space that was seen to be empty."""
 
-    def resized(self, height: int, width: int) -> "CompletedDepth":
+    def resized(self, height: int, width: int) -> "PredictedDepth":
         """The same for a picture of another size."""
         if self.depth.shape == (height, width):
             return self
         maps = torch.stack([self.depth, self.confidence, self.certain.to(self.depth.dtype)])
         depth, confidence, certain = resample_surfaces(maps, (height, width))
-        return CompletedDepth(depth, confidence.clamp(0, 1), certain > 0.5)
+        return PredictedDepth(depth, confidence.clamp(0, 1), certain > 0.5)
 
 
-class DepthCompletion(Protocol):
-    """Whatever completes the depth of a generated view; a test's oracle is one, too."""
+class DepthPredictor(Protocol):
+    """Predicts the depth of a generated view; the network does, and a test's oracle."""
 
-    def __call__(self, known: GlobalMap, picture: View, indices: Sequence[int]) -> CompletedDepth:
+    def __call__(self, known: GlobalMap, picture: View, indices: Sequence[int]) -> PredictedDepth:
         """The depth of a picture, of which the map's views `indices` show parts."""
         ...
 
 
 @dataclass(frozen=True)
-class NetworkCompletion:
+class NetworkDepth:
     """The network's answer, corrected so that it meets the map where that is certain."""
 
     network: DepthNetwork
@@ -65,12 +65,12 @@ class NetworkCompletion:
     """Measures what the network starts from."""
 
     @torch.inference_mode()
-    def __call__(self, known: GlobalMap, picture: View, indices: Sequence[int]) -> CompletedDepth:
-        """See `DepthCompletion`."""
+    def __call__(self, known: GlobalMap, picture: View, indices: Sequence[int]) -> PredictedDepth:
+        """See `DepthPredictor`."""
         seen = observe_in_map(known, picture, indices, self.source)
         log_depth, confidence = self.network(seen.features).best()
         fitted = fit_to_known(log_depth[0], seen.warp_log_depth[0], seen.certain[0])
-        completed = CompletedDepth(
+        completed = PredictedDepth(
             seen.depth(fitted[None])[0], confidence[0].clamp(0, 1), seen.certain[0]
         )
         return completed.resized(picture.camera.height, picture.camera.width)
