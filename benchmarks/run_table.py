@@ -140,7 +140,7 @@ def _run(
         with _launchers(isolated, options.launcher, len(jobs)) as (making, scoring):
             made = _make(left.to_make, making, folder)
             images = [
-                replace(job, images_from=job.folder)
+                replace(job, unscored_cell=job.folder)
                 for job, cell in zip(left.to_make, made, strict=True)
                 if cell.images
             ]

@@ -30,9 +30,10 @@ from extrap_train.store.records import write_record
 
 Row = dict[str, str]
 METRIC = "result."
+"""Prefix of the metrics' columns, which keeps them apart from options of the same name."""
 _TABLE = "sweep.csv"
 _ONLY = "every job"
-"""Before the names of metrics, which could be those of options."""
+"""Label of jobs that differ in nothing but their seed."""
 _HEAD, _TAIL = ("job", "status", "seconds"), ("folder", "reason")
 _NO_OPTIONS = (*_HEAD, *_TAIL)
 OK, REUSED, FAILED = "ok", "reused", "failed"

@@ -30,8 +30,6 @@ class Verification:
 
     cells: int = 0
     """How many were scored again."""
-    apart: int = 0
-    """How many of them say that no truth was in their method's reach."""
     problems: list[str] = field(default_factory=list)
     """What does not agree, one line each."""
     unchecked: dict[str, str] = field(default_factory=dict)
@@ -53,7 +51,6 @@ def verify(folder: TableFolder, lpips_weights: Mapping[str, str] | None = None) 
         problems = [*_identity_problems(results, cell, scene)]
         if cell.status == OK:
             found.cells += 1
-            found.apart += cell.truths_apart
             problems += _score_problems(results, cell, scene, scoring, unchecked)
         found.problems += [f"{cell.key} ({cell.method}): {p}" for p in problems]
     missing = set(results.plan.cells) - {cell.key for cell in results.cells}

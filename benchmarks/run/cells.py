@@ -89,8 +89,6 @@ class Cell(MethodOutput):
     protocol: str
     made_from: Manifest
     scored_from: Manifest
-    truths_apart: bool = False
-    """Whether no truth was on the disk or in the method's process while it ran."""
     scoring_seconds: Positive | None = None
     metrics: dict[str, Score] = field(default_factory=dict)
     images: dict[FileName, str] = field(default_factory=dict)
@@ -206,8 +204,8 @@ class CellJob:
     protocol: str
     made_from: Manifest
     scored_from: Manifest
-    images_from: Path | None = None
-    """A cell with the very same images, which only need scoring."""
+    unscored_cell: Path | None = None
+    """Folder of a cell with the same images, which only need scoring."""
 
 
 def failed_output(reason: str) -> CheckedOutput:
@@ -215,7 +213,7 @@ def failed_output(reason: str) -> CheckedOutput:
     return CheckedOutput(MethodOutput(status=FAILED, reason=reason))
 
 
-def _record(job: CellJob, output: MethodOutput, *, truths_apart: bool) -> Cell:
+def _record(job: CellJob, output: MethodOutput) -> Cell:
     """The record of what a method made for a job."""
     measured = {each.name: getattr(output, each.name) for each in fields(MethodOutput)}
     return Cell(
@@ -226,16 +224,13 @@ def _record(job: CellJob, output: MethodOutput, *, truths_apart: bool) -> Cell:
         protocol=job.protocol,
         made_from=job.made_from,
         scored_from=job.scored_from,
-        truths_apart=truths_apart,
         **{name: getattr(job.draw, name) for name in _DRAW},
     )
 
 
 def keep_output(job: CellJob, result: CheckedOutput) -> Cell:
-    """Write the cell of what a method has made while no truth was there, unscored, or of why it
-    has not.
-    """
-    record = _record(job, result.output, truths_apart=result.output.status == MADE)
+    """Write a method's output as a cell that is not scored yet, or the reason why there is none."""
+    record = _record(job, result.output)
     images = {f"{index}.png": png_bytes(pixels) for index, pixels in enumerate(result.images)}
     points = {}
     if result.points is not None:
@@ -248,15 +243,15 @@ def score_cell(job: CellJob) -> Cell:
     torch.set_num_threads(1)
     from benchmarks.score.scoring import score_files  # heavy, and only scoring needs it
 
-    assert job.images_from is not None
+    assert job.unscored_cell is not None
     started = time.perf_counter()
-    made = read_cell(job.images_from)
+    made = read_cell(job.unscored_cell)
     if made is None:
-        raise InputError(f"{job.images_from}: is gone; run the table again")
-    images, points = read_files(job.images_from, made)
-    record = replace(_record(job, made, truths_apart=made.truths_apart), status=OK, reason="")
+        raise InputError(f"{job.unscored_cell}: is gone; run the table again")
+    images, points = read_files(job.unscored_cell, made)
+    record = replace(_record(job, made), status=OK, reason="")
     try:
-        scores = score_files(job.images_from, images, points, Scene.open(job.scene), job.scoring)
+        scores = score_files(job.unscored_cell, images, points, Scene.open(job.scene), job.scoring)
         took = time.perf_counter() - started
         record = replace(record, metrics=scores, scoring_seconds=took)
     except ValueError as error:

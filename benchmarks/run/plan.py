@@ -217,7 +217,7 @@ def open_jobs(jobs: list[CellJob], folder: TableFolder, say: Callable[[str], Non
             continue
         images = _cells_with_images(folder) if images is None else images
         if there := images.get(identity_of(job.made_from)):
-            found.to_score.append(replace(job, images_from=there))
+            found.to_score.append(replace(job, unscored_cell=there))
         else:
             found.to_make.append(job)
     return found

@@ -1,4 +1,7 @@
-"""May a model be measured on a capture? The one rule, for trainings as for tables."""
+"""Which held-out captures a model was trained on.
+
+`tasks/training_data.py` refuses them for training, `benchmarks/protocol/captures.py` for tables.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,9 +29,9 @@ class Training:
         count within their category, and under another seed are other objects.
         """
         seen = self.split
-        is_own = category == self.category or seen.source != "synthetic"
+        same_namespace = category == self.category or seen.source != "synthetic"
         has_seed = None not in (held_out.seed, seen.seed)
-        if not is_own or held_out.source != seen.source:
+        if not same_namespace or held_out.source != seen.source:
             return []
         if has_seed and held_out.seed != seen.seed:
             return []

@@ -1,6 +1,6 @@
 """From a few posed photographs to a full turn: views are added one at a time (paper II-C).
 
-`global_map` holds what is known, `planner` says where the next view is made, `new_view` gives it
-depth, `completion` runs the loop, `cloud` reads the points off. Nothing that is known is ever
-estimated again.
+`global_map` holds the views so far, `planner` chooses the next viewpoint, `new_view` gives its
+picture depth, and `completion` runs the loop. Adding a view never changes earlier ones. Once all
+views exist, `fusion` adjusts the generated depths; `cloud` and `mesh` extract the result.
 """

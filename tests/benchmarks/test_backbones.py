@@ -121,11 +121,11 @@ def test_verification_judges_with_the_very_weights_or_says_that_it_did_not(
     words = [*_ONE_ROW, f"scoring.lpips_weights.squeeze={weights}"]
     assert run_greys(own, tmp_path, *words, quick=True) == 0
     folder = greys_folder(tmp_path)
-    assert verify(folder) == Verification(cells=1, apart=1)
+    assert verify(folder) == Verification(cells=1)
     moved = weights.rename(tmp_path / "elsewhere.pt")
     here = {"lpips_squeeze": "its weights are not here; give scoring.lpips_weights.squeeze=FILE"}
-    assert verify(folder) == Verification(cells=1, apart=1, unchecked=here)
-    assert verify(folder, {"squeeze": str(moved)}) == Verification(cells=1, apart=1)
+    assert verify(folder) == Verification(cells=1, unchecked=here)
+    assert verify(folder, {"squeeze": str(moved)}) == Verification(cells=1)
     put_backbone(0)
     assert "not those" in verify(folder).unchecked["lpips_squeeze"]
     capsys.readouterr()
