@@ -28,7 +28,10 @@ FUSION_ROUNDS = 3
 LEAST_PAIRS = 16
 """An edge with fewer usable pairs says nothing."""
 WIDTH = 4.685
-"""Of Tukey's biweight in standard deviations: 95 % efficient on Gaussian noise."""
+"""Width of Tukey's biweight in standard deviations: 95 % efficient on Gaussian noise."""
+VECTOR_WIDTH = 1.5 * WIDTH
+"""Width of the biweight for lengths of 3-D residuals, which are √3 standard deviations of a
+coordinate on average (root mean square): 98 % efficient on Gaussian noise."""
 _CHI3_MEDIAN = 1.538
 """Median length of a 3-D Gaussian vector, in standard deviations of a coordinate."""
 _GAUSSIAN_MEDIAN = 0.6745
@@ -133,12 +136,12 @@ def _similarities(pairs: _Pairs) -> tuple[Float[Tensor, "e 4 4"], Float[Tensor, 
         fitted = (scale[:, None, None] * rotation) @ pairs.world + shift[..., None]
         residual = _length(fitted - pairs.edge)
         relative = residual / extent
-        median = _masked_median(relative, pairs.weight > 0)
+        median = _strided_median(relative, pairs.weight > 0)
         sigma = (median / _CHI3_MEDIAN).clamp(min=_LEAST_SPREAD)
         ratio = relative / sigma[:, None]
         # A convex kernel finds the basin, a redescending one forgets what lies outside of it.
-        last = step >= SIMILARITY_ROUNDS // 2
-        robust = _biweight(ratio / (WIDTH * 1.5)) if last else 1 / (1 + ratio)
+        redescending = step >= SIMILARITY_ROUNDS // 2
+        robust = _biweight(ratio / VECTOR_WIDTH) if redescending else 1 / (1 + ratio)
     inverse_scale = 1 / scale
     linear = inverse_scale[:, None, None] * rotation.mT
     matrix = torch.eye(4).to(linear).repeat(len(linear), 1, 1)
@@ -169,7 +172,7 @@ def _trust(spread: Float[Tensor, " e"], usable: Bool[Tensor, " e"]) -> Float[Ten
 
     A good fit to the known view is no proof: smooth errors vanish in it and stay in the new one.
     """
-    median = _masked_median(spread[None], usable[None])
+    median = _strided_median(spread[None], usable[None])
     return 1 / (1 + (spread / (_FAR_WORSE * median.clamp(min=_LEAST_SPREAD))).square())
 
 
@@ -211,7 +214,7 @@ def _robust_mean(
     for _ in range(FUSION_ROUNDS):
         residual = (log - center).abs()
         several = known & (known.sum(0) > 1)
-        sigma = _masked_median(residual.flatten()[None], several.flatten()[None])
+        sigma = _strided_median(residual.flatten()[None], several.flatten()[None])
         sigma = (sigma / _GAUSSIAN_MEDIAN).clamp(min=_LEAST_SPREAD)
         robust = _biweight(residual / (WIDTH * sigma)) * known
         total = (reliable * robust).sum(0)
@@ -238,8 +241,11 @@ def _weighted_median(values: Float[Tensor, "e h w"], weight: Float[Tensor, "e h 
     return (values * least).sum(0) / least.sum(0)
 
 
-def _masked_median(values: Float[Tensor, "e n"], mask: Bool[Tensor, "e n"]) -> Float[Tensor, " e"]:
-    """The lower median of each row's masked entries, of an even choice of them; 0 without any."""
+def _strided_median(values: Float[Tensor, "e n"], mask: Bool[Tensor, "e n"]) -> Float[Tensor, " e"]:
+    """The lower median of each row's masked entries; 0 without any.
+
+    Of longer rows every n-th entry is ranked, `MOST_RANKED` to twice as many.
+    """
     stride = max(1, values.shape[1] // MOST_RANKED)
     chosen = torch.where(mask[:, ::stride], values[:, ::stride], torch.nan)
     return chosen.nanmedian(-1).values.nan_to_num()

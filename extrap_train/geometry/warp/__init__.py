@@ -1,5 +1,8 @@
 """The warped image: what the references show of the query view (paper II-A, Eq. 1).
 
+A pixel is a hole if no point reaches its centre (`splat`). Points are never made on back faces or
+at depth jumps (`sample`, `surface`), and are dropped behind unseen space (`occlusion`).
+
 `warp_references` is the whole of it. Each step is there twice: in torch, for GPUs and gradients,
 and as compiled loops for the CPU, in the file whose name ends in `_numba`. The torch files explain
 the method and own its constants; both give the same picture within rounding, and the loops give the

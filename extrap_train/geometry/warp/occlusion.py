@@ -22,7 +22,7 @@ SPACING = 0.7
 """Query pixels between points of a wall, of which each fills the one pixel that it falls in."""
 TOLERANCE = 0.01
 """Share of its depth by which a point must lie behind a wall to be hidden."""
-MOST_POINTS = 256
+MAX_WALL_POINTS = 256
 """Points of one wall from front to back."""
 ACROSS = 3
 """Points of a wall along the edge, per reference pixel."""
@@ -54,7 +54,7 @@ def occlusion_depth(
     image, side, v, u, start, stop = _occlusion_volumes(surface, cameras)
     walls = matrix.detach().reshape(-1, 3, 4)[image]
     length = _length(walls, u, v, start, stop)
-    along = (length / SPACING).nan_to_num(0).clamp(1, MOST_POINTS).ceil().long()
+    along = (length / SPACING).nan_to_num(0).clamp(1, MAX_WALL_POINTS).ceil().long()
     wall, offset = subdivide(torch.stack([along, torch.full_like(along, ACROSS)], -1))
     inverse = start[wall] + (stop - start)[wall] * (offset[:, 0] + 0.5)
     upright = side[wall] < 2

@@ -12,7 +12,7 @@ _HALF, _ONE, _TWO = np.float32(0.5), np.float32(1), np.float32(2)
 _LEAST_RATIO = np.float32(LEAST_DEPTH_RATIO)
 _DEPTH_PER_WIDTH = np.float32(occlusion.DEPTH_PER_WIDTH)
 _SPACING = np.float32(occlusion.SPACING)
-_MOST_POINTS = np.float32(occlusion.MOST_POINTS)
+_MAX_WALL_POINTS = np.float32(occlusion.MAX_WALL_POINTS)
 _ACROSS = occlusion.ACROSS
 
 
@@ -64,7 +64,7 @@ def _draw_wall(m, u, v, start, stop, upright, unseen):
     x0, y0, _ = project(m, u, v, start)
     x1, y1, _ = project(m, u, v, stop)
     length = np.float32(math.sqrt((x1 - x0) * (x1 - x0) + (y1 - y0) * (y1 - y0)))
-    count = math.ceil(min(max(length / _SPACING, _ONE), _MOST_POINTS))
+    count = math.ceil(min(max(length / _SPACING, _ONE), _MAX_WALL_POINTS))
     for i in range(count):
         along = (np.float32(i) + _HALF) / np.float32(count) - _HALF + _HALF
         inverse = start + (stop - start) * along

@@ -26,7 +26,7 @@ a footprint."""
 REACH_MARGIN = 0.03
 """Query pixels by which neighbouring pieces of surface overlap, so that no seam shows what is
 behind."""
-MOST_POINTS = 8
+MAX_POINTS_PER_AXIS = 8
 """Points per reference pixel along each axis: a surface stretched further is torn, it was hardly
 seen."""
 
@@ -123,7 +123,7 @@ def _points_per_axis(steps: Float[Tensor, "b k h w 2 2"]) -> Int[Tensor, "b k h 
     """Points along u and v that keep their spacing in the query below `LARGEST_SPACING`."""
     across, down = steps.detach().square().unbind(-1)
     length = (across + down).sqrt()
-    return (length / LARGEST_SPACING).clamp(max=MOST_POINTS).ceil().clamp(min=1).long()
+    return (length / LARGEST_SPACING).clamp(max=MAX_POINTS_PER_AXIS).ceil().clamp(min=1).long()
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from extrap_train.views import Camera
 _ZERO, _HALF, _ONE, _TWO = (np.float32(x) for x in (0, 0.5, 1, 2))
 _LARGEST_SPACING = np.float32(sample.LARGEST_SPACING)
 _REACH_MARGIN = np.float32(sample.REACH_MARGIN)
-_MOST_POINTS = sample.MOST_POINTS
+_MAX_POINTS = sample.MAX_POINTS_PER_AXIS
 _LEAST_RATIO = np.float32(LEAST_DEPTH_RATIO)
 _WALL_LIMIT = np.float32(1 + occlusion.TOLERANCE)
 _RIM = np.float32(1.5)
@@ -33,10 +33,10 @@ _RIM = np.float32(1.5)
 rounding."""
 _ROWS = 16
 """Rows of a reference that are filled in one go."""
-_OFFSETS = np.zeros((_MOST_POINTS + 1, _MOST_POINTS), np.float32)
+_OFFSETS = np.zeros((_MAX_POINTS + 1, _MAX_POINTS), np.float32)
 """Where in a pixel, counted from its centre, the points lie, by the number that it is cut into."""
-for _n in range(1, _MOST_POINTS + 1):
-    _OFFSETS[_n] = (np.arange(_MOST_POINTS, dtype=np.float32) + _HALF) / np.float32(_n) - _HALF
+for _n in range(1, _MAX_POINTS + 1):
+    _OFFSETS[_n] = (np.arange(_MAX_POINTS, dtype=np.float32) + _HALF) / np.float32(_n) - _HALF
 
 
 def sample_surfaces_numba(
@@ -201,7 +201,7 @@ def _step(m, u, v, ratio, axis, slope):
 @compiled()
 def _points_along(across, down):
     length = np.float32(math.sqrt(across * across + down * down)) / _LARGEST_SPACING
-    return max(math.ceil(min(length, np.float32(_MOST_POINTS))), 1)
+    return max(math.ceil(min(length, np.float32(_MAX_POINTS))), 1)
 
 
 @compiled(parallel=True)
