@@ -157,7 +157,7 @@ def _check_network(model: ModelConfig) -> None:
     coarsest = factor * 2 ** (len(model.unet.channels) - 1)
     if model.image_size % coarsest:
         raise InputError(
-            f"model.image_size={model.image_size} is no multiple of {coarsest}, "
+            f"model.image_size={model.image_size} is not a multiple of {coarsest}, "
             "which the latents' factor and the levels of model.unet.channels need"
         )
     if len(model.unet.channels) != len(model.unet.attention_levels):
@@ -173,7 +173,7 @@ def _check_intervals(trainer: TrainerConfig) -> None:
     """Validation looks at the averaged weights of a checkpoint."""
     if trainer.validate_every % trainer.checkpoint_every:
         raise InputError(
-            f"trainer.validate_every={trainer.validate_every} is no multiple of "
+            f"trainer.validate_every={trainer.validate_every} is not a multiple of "
             f"trainer.checkpoint_every={trainer.checkpoint_every}: give one that is"
         )
 
@@ -182,8 +182,8 @@ def _check_inputs(config: TrainConfig) -> None:
     named = len(config.input_frames)
     if named and config.inputs is not None:
         raise InputError(
-            f"inputs={config.inputs} beside input_frames, which names {named} frames: leave one of "
-            "them out"
+            f"inputs={config.inputs} and input_frames ({named} frames) are both given; give only one "
+            "of them"
         )
     if config.task == "complete" and (named or config.inputs) == 1:
         raise InputError(

@@ -178,12 +178,16 @@ def _lens(camera: ModelCamera, file: Path) -> Lens:
             f"{', '.join(m.name for m in CAMERA_MODELS)} can be undone; run COLMAP's "
             "image_undistorter first"
         )
-    count, height, width = len(camera.parameters), camera.height, camera.width
-    sized = height > 0 and width > 0 and height * width <= MAX_PIXELS
-    if count != len(model.parameters) or not sized:
+    where = f"{file}: camera {camera.number} ({model.name})"
+    count, expected = len(camera.parameters), len(model.parameters)
+    if count != expected:
         raise InputError(
-            f"{file}: camera {camera.number} ({model.name}) has {count} parameters and size "
-            f"{height} x {width}, expected {len(model.parameters)} of them; export the model again"
+            f"{where} has {count} parameters, expected {expected}; export the model again"
+        )
+    height, width = camera.height, camera.width
+    if height <= 0 or width <= 0 or height * width > MAX_PIXELS:
+        raise InputError(
+            f"{where}: its size {height} x {width} is not valid; export the model again"
         )
     named = dict(zip(model.parameters, camera.parameters, strict=True))
     return lens_from_parameters(named, model.fisheye)

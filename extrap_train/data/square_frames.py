@@ -172,7 +172,7 @@ def _remedy(source: DepthSource) -> str:
     """For a sequence without any depth: only depth that comes with the data can be estimated."""
     if source.image_size is None:
         return "use depth=stereo"
-    return "are its photographs blank, or its poses wrong? Mend or remove it"
+    return "check for blank photographs or wrong poses, or remove the sequence"
 
 
 def _usable_views(sequence: FrameSequence, where: str, size: int, *, depth: bool) -> list[View]:

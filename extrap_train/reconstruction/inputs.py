@@ -93,11 +93,13 @@ def check_cameras(cameras: Sequence[Camera], names: Sequence[str]) -> None:
     center = scene_center(poses)
     seen = facing(poses, center, LOOKS_AT_RAD)
     if not seen.all():
-        strays = ", ".join(np.array(names)[~seen][:3])
+        strays = np.array(names)[~seen]
+        more = f" and {len(strays) - 3} more" if len(strays) > 3 else ""
+        look, them = ("looks", "it") if len(strays) == 1 else ("look", "them")
         raise InputError(
-            f"{strays}: looks away from what the other photographs look at, so that they see "
-            "nothing in common; check the poses (their axes: +X right, +Y down, +Z forward after "
-            "reading) or leave it out"
+            f"{', '.join(strays[:3])}{more}: {look} away from what the other photographs look at, "
+            "so that they see nothing in common; check the poses (their axes: +X right, +Y down, "
+            f"+Z forward after reading) or leave {them} out"
         )
     angles = pairwise_angles(poses, center)
     apart = np.linalg.norm(np.diff(camera_centers(poses), axis=0), axis=1).max()

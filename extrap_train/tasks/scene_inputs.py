@@ -66,7 +66,8 @@ def input_frames(
     part = sequence if config.input_frames else replace(sequence, frames=known)
     if not part.frames:
         raise InputError(
-            f"scene {config.scene}: {query} is its only frame, and is asked for; give more"
+            f"{config.scene}: the scene's only frame, {query}, is the one that pose= asks for; the "
+            "scene needs at least one other"
         )
     return part, select_input_frames(part, config.input_frames, config.inputs)
 

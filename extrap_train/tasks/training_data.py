@@ -38,7 +38,7 @@ def require_unseen(start: str | None, manifest: Manifest) -> None:
             remedy = _other_seed(seen.split.train[0]) if split.source == "synthetic" else _OTHERS
             raise InputError(
                 f"model.start={start} was trained on {_listed(names)} of {category}{through}, "
-                f"which are to be held out: {remedy}, or model.start=null"
+                f"which this run would hold out for testing; {remedy}, or model.start=null"
             )
 
 

@@ -190,7 +190,7 @@ def test_a_frame_whose_annotation_names_no_depth_costs_no_more_than_itself(
 
 
 @pytest.mark.parametrize(
-    ("size", "advice"), [(None, "use depth=stereo"), (32, "are its photographs blank")]
+    ("size", "advice"), [(None, "use depth=stereo"), (32, "check for blank photographs")]
 )
 def test_a_sequence_without_depth_is_not_sent_where_it_comes_from(
     size: int | None, advice: str

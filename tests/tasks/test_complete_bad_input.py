@@ -97,7 +97,7 @@ def test_a_number_beside_names_is_refused(
 ) -> None:
     (tmp_path / "scene").mkdir()
     both = [f"task={task}", f"inputs={inputs}", "input_frames=[a.png,b.png]"]
-    assert f"inputs={inputs} beside input_frames" in refused({"no": "cameras"}, *both)
+    assert f"inputs={inputs} and input_frames (2 frames)" in refused({"no": "cameras"}, *both)
 
 
 def test_a_scene_of_another_category_needs_a_named_model(
