@@ -68,7 +68,7 @@ class RunOptions:
     workers: int = 0
     """Processes; 0 takes every core, or one on a GPU."""
     launcher: Launcher | None = None
-    """Where cells are made and scored, in place of processes here."""
+    """Where cells are made and scored instead of in processes here."""
 
 
 def run_table(table: TableConfig, catalogue: Catalogue, options: RunOptions) -> int:

@@ -1,8 +1,8 @@
 """Warp correction: where a pair's warp really belongs in its query view (paper III-A.1).
 
 Wrong depths shift the warped image against the true one. A matcher finds where the warp's pixels
-are in the truth, a smooth flow is fitted to what is no outlier, and the warp is drawn again with
-its points moved by it. A correction must prove itself, and not only by what it was fitted to: any
+are in the truth, a smooth flow is fitted to the inliers, and the warp is drawn again with its
+points moved by it. A correction must prove itself, and not only by what it was fitted to: any
 two pictures come closer if one may be bent. Wrong depths move points along their epipolar lines
 alone, so that matches that leave those lines are chance, and the warp stays as it is.
 """
@@ -39,7 +39,7 @@ LEAST_GAIN = 0.01
 """Share of the photometric error that a correction must take away: less is within what resampling
 does to a warp. Says nothing of chance, which takes away as much."""
 STIFFER = (1e-4, 1e-3)
-"""Also tried in place of `spline_flow.STIFFNESS`: noise in the depths shakes a field that bends
+"""Also tried instead of `spline_flow.STIFFNESS`: noise in the depths shakes a field that bends
 easily."""
 MOST_MATCHES = 2000
 """A smooth field needs no more."""

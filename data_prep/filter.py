@@ -54,7 +54,7 @@ def judge_all(sequences: Sequence[FrameSequence], options: PrepConfig) -> list[V
 
 
 def judge(sequence: FrameSequence, options: PrepConfig) -> Verdict:
-    """Keep or drop a sequence; a quality that the capture does not state is no reason."""
+    """Keep or drop a sequence; a quality that the capture does not state is not a reason."""
     count = len(sequence.frames)
     if too_many := too_many_unusable(sequence.left_out, sequence):
         return Verdict(False, too_many, count)

@@ -32,7 +32,7 @@ LOG = logging.getLogger(__name__)
 HERE = LocalLauncher(1)
 """Runs jobs one after the other in this process."""
 _BYTES_PER_PIXEL = 3 + 2 + 1
-"""Of a stored frame: colours, depth, mask."""
+"""Bytes per pixel of a stored frame: colours, depth, mask."""
 
 
 @dataclass(frozen=True)

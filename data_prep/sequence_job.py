@@ -51,7 +51,7 @@ _OPTIONS = (
     "correction_grid",
 )
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
-"""What ends the whole run: the next sequence would find no room either."""
+"""What ends the whole run: the next sequence would not fit either."""
 
 
 def pair_options(options: PrepConfig) -> dict[str, Any]:

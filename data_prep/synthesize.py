@@ -61,7 +61,7 @@ class _Job:
 
     @property
     def name(self) -> str:
-        """Of the sequence, and of its folder."""
+        """Name of the sequence and of its folder."""
         return sequence_name(self.index)
 
     @property
@@ -108,8 +108,8 @@ def _require_ours(folder: Path, jobs: list[_Job]) -> None:
         foreign += _foreign_annotations(folder, made)
     if foreign:
         raise InputError(
-            f"{folder}: is no folder of synthetic captures, for it holds {foreign[0].name}, and is "
-            "left as it is; did you mean data=co3d? For synthetic captures give another data.root"
+            f"{folder}: is not a folder of synthetic captures (it holds {foreign[0].name}) and "
+            "is left as it is; did you mean data=co3d? Otherwise give another data.root"
         )
 
 

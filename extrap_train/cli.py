@@ -129,7 +129,7 @@ def compose_config(options: CommandOptions, words: Sequence[str]) -> Any:
 
 
 def _complete(options: CommandOptions, run: Callable[[Any], Outcome | Path | None]) -> None:
-    """Hydra's words for the shell, without the schemas, which are no choices."""
+    """Hydra's words for the shell, without the schemas, which are not choices."""
     words = io.StringIO()
     with contextlib.redirect_stdout(words):
         _compose(options, run)

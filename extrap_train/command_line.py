@@ -30,7 +30,7 @@ def explain(error: Exception, options: CommandOptions, overrides: Sequence[str])
         where = error.problem_mark if isinstance(error, MarkedYAMLError) else None
         place = f"{where.name}, line {where.line + 1}" if where else "a file of options"
         problem = error.problem if isinstance(error, MarkedYAMLError) else error
-        return f"{place}: is no valid YAML ({problem}); correct it"
+        return f"{place}: is not valid YAML ({problem}); correct it"
     if "ConfigKeyError" in str(error) and (
         found := re.match(r"In '(.+)': .*\n(?:.*\n)*? *full_key: (\S+)", str(error))
     ):
@@ -201,7 +201,7 @@ def _without_interpolation(text: str) -> str:
 
 
 def _parse(key: str, value: str) -> object:
-    """The value as Hydra's grammar has it; None where it is no value."""
+    """The value as Hydra's grammar has it; None where it is not a value."""
     try:
         return OverridesParser.create().parse_override(f"{key}={value}")._value
     except HydraException:

@@ -35,7 +35,7 @@ def ends_in_one_line() -> Iterator[None]:
     """Turn every expected way to end early into `Ended`, and its line on stderr.
 
     Unusable input is `error: …` with status 1, Ctrl-C `interrupted: …` with 130, SIGTERM
-    `terminated: …` with 143. A reader of the output that has gone is no error: nothing is said.
+    `terminated: …` with 143. A reader of the output that has gone is not an error: nothing is said.
     Anything else is a bug and keeps its traceback.
     """
     _open_closed_streams()

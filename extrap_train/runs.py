@@ -63,7 +63,7 @@ model recommends to sample with is part of the run as far as it is used, under `
 """
 
 _MAX_NAME_BYTES = 150
-"""Of a result's folder: files beside it add the writer to its name, in 255 bytes at most."""
+"""Longest name of a result's folder: files beside it add the writer to it, within 255 bytes."""
 _LATEST = "latest"
 """Link to the newest run of a model and category."""
 
@@ -117,11 +117,11 @@ class Finished:
     steps: int
     provenance: _HowMeasured
     model_sha256: str | None = None
-    """Of the folder of the model that was measured."""
+    """Digest of the folder of the model that was measured."""
 
     @classmethod
     def read(cls, folder: RunFolder) -> "Finished":
-        """Of a run that has a summary; InputError if that is damaged."""
+        """The record of a run that has a summary; InputError if that is damaged."""
         remedy = "delete it, and task=category measures the run again"
         return read_record(folder.summary, cls, remedy)
 

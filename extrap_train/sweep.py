@@ -141,7 +141,7 @@ def _options(overrides: Iterable[str]) -> dict[str, str]:
 
 
 def _give_objective(job: JobReturn, row: Row, objective: str) -> None:
-    """The metric in place of the folder; a job that lacks it has failed."""
+    """Make the metric the job's value instead of the folder; a job that lacks it has failed."""
     found = row.get(METRIC + objective)
     if found is not None:
         job.return_value = float(found)
@@ -192,7 +192,7 @@ def add_row(file: Path, row: Row) -> pd.DataFrame:
 
 
 def read_rows(file: Path) -> pd.DataFrame:
-    """The rows that are there, as texts; InputError where the file is no such table any more."""
+    """The rows that are there, as texts; InputError where the file is no longer such a table."""
     if not file.is_file():
         return pd.DataFrame(columns=[*_HEAD, *_TAIL], dtype=str)
     try:
@@ -202,7 +202,7 @@ def read_rows(file: Path) -> pd.DataFrame:
         if missing := {*_NO_OPTIONS} - {*rows}:
             raise ValueError(f"it has no column {min(missing)}")
         if not rows["job"].str.fullmatch("[0-9]{1,9}").all():
-            raise ValueError("a job is no number")
+            raise ValueError("a job is not a number")
         rows.filter(like=METRIC).replace("", None).apply(pd.to_numeric)
     except ValueError as error:
         reason = " ".join(str(error).split())
@@ -306,7 +306,7 @@ def _shown_metrics(rows: pd.DataFrame) -> list[str]:
 
 
 def _labels(rows: pd.DataFrame) -> "pd.Series[str]":
-    """Of every row the overrides that tell the jobs apart."""
+    """For every row, the overrides that tell the jobs apart."""
     options = [n for n in map(str, rows) if n not in _NO_OPTIONS and not n.startswith(METRIC)]
     apart = [name for name in options if rows[name].nunique() > 1]
     texts = [

@@ -16,7 +16,7 @@ T = TypeVar("T")
 DRAWN_EVERY_S = 0.25
 """On a terminal."""
 LINE_EVERY_S = 10.0
-"""A bar writes at most one line in this time where the output is no terminal."""
+"""A bar writes at most one line in this time where the output is not a terminal."""
 LINE_EVERY_SHARE = 0.05
 """The least share of a bar between two of its lines."""
 _BRIEF_S = 2.0
@@ -25,7 +25,7 @@ _BAR_COLUMNS = 24
 
 
 def terminal(*, stderr: bool = False, quiet: bool = False) -> Console:
-    """A console that says text as it is: what stands in brackets is no markup, nothing between
+    """A console that says text as it is: what stands in brackets is not markup, nothing between
     colons a picture, and a line is not folded, so that a path can be taken from it.
     """
     return _Console(stderr=stderr, quiet=quiet, markup=False, emoji=False, soft_wrap=True)

@@ -1,5 +1,6 @@
-"""The nouns that travel: cameras, views, and what a batch is made of. Conventions:
-`extrap_train.geometry`.
+"""Data types shared by all packages: cameras, views, warps, batches.
+
+Conventions: `extrap_train.geometry`.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,7 +20,7 @@ _SAME_SURFACE = 0.02
 def combine(parts: Sequence[T], join: Callable[[Sequence[Tensor]], Tensor]) -> T:
     """One value from several alike: tensors, in dataclasses of any depth, are joined.
 
-    Whatever is no tensor is taken from the first.
+    Whatever is not a tensor is taken from the first.
     """
     first: Any = parts[0]
     if isinstance(first, Tensor):

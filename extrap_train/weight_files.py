@@ -39,7 +39,7 @@ DAMAGE = (
 )
 """What torch and the readers of its archives raise on files that are damaged or not torch's."""
 _MAX_PICKLE_BYTES = 16 * 2**20
-"""Of the table beside the tensors; that of Stable Diffusion's two thousand has 0.3 MiB."""
+"""Largest table beside the tensors; that of Stable Diffusion's two thousand has 0.3 MiB."""
 
 
 class Inert:
@@ -110,7 +110,7 @@ class WeightFile:
             if not isinstance(name, str) or not isinstance(x, Tensor):
                 raise self.refusal("holds no table of named tensors")
             if x.layout is not torch.strided or x.is_quantized or x.device.type != "cpu":
-                raise self.refusal(f"{name} is no plain tensor")
+                raise self.refusal(f"{name} is not a plain tensor")
             if x.numel() * x.element_size() > x.untyped_storage().nbytes():
                 raise self.refusal(f"{name} has a shape of more numbers than the file holds")
         return dict(inner)
@@ -119,7 +119,7 @@ class WeightFile:
         """Put `state` into `network`, name by name and shape by shape, in the network's precision.
 
         Parameters on the meta device become those of `state`, without a copy. Raises InputError
-        that says how the two differ; integers are no weights.
+        that says how the two differ; integers are not weights.
         """
         own = network.state_dict()
         missing, strange = sorted(own.keys() - state.keys()), sorted(state.keys() - own.keys())
@@ -164,7 +164,7 @@ class WeightFile:
             if not self.path.exists():
                 raise self.refusal("there is no such file")
             if not self.path.is_file():
-                raise self.refusal("is no regular file")
+                raise self.refusal("is not a regular file")
             self.path.open("rb").close()
         except OSError as error:
             raise self.refusal(f"cannot be opened ({error.strerror})") from None

@@ -1,4 +1,4 @@
-"""Imports point one way, between the rooms of `extrap_train` as between the three packages."""
+"""Imports point one way, within `extrap_train` as between the three top-level packages."""
 
 import ast
 import functools
@@ -40,12 +40,12 @@ _ORDER = (
     "benchmarks",
     "extrap_train.api",
 )
-"""Every room imports only from rooms before it, so there is no cycle between rooms or packages."""
+"""Every package imports only from those before it, so there is no cycle."""
 _PACKAGES = ("extrap_train", "data_prep", "benchmarks")
 _FILES = sorted(path for package in _PACKAGES for path in (_ROOT / package).rglob("*.py"))
 
 
-def _room(module: str) -> str | None:
+def _package_of(module: str) -> str | None:
     return next((r for r in _ORDER if module == r or module.startswith(f"{r}.")), None)
 
 
@@ -63,7 +63,7 @@ def _imports(path: Path) -> list[str]:
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
-            of_package = node.module in _PACKAGES  # `from extrap_train import views`: a room
+            of_package = node.module in _PACKAGES  # `from extrap_train import views`: a package
             names += [f"{node.module}.{alias.name}" for alias in node.names if of_package]
             names += [] if of_package else [str(node.module)]
     return names
@@ -76,15 +76,15 @@ def test_imports_point_one_way() -> None:
         module = _module(path)
         if module.endswith("__main__") or module == "extrap_train":
             continue
-        here = _room(module)
+        here = _package_of(module)
         if here is None:
-            wrong.append(f"{module} is in no room")
+            wrong.append(f"{module} is in no package of the order")
             continue
         below = _ORDER[: _ORDER.index(here) + 1]
         wrong += [
             f"{module} imports {name}"
             for name in _imports(path)
-            if name.split(".")[0] in _PACKAGES and _room(name) not in below
+            if name.split(".")[0] in _PACKAGES and _package_of(name) not in below
         ]
     assert not wrong
 

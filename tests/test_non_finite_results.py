@@ -1,4 +1,4 @@
-"""A training, a sweep or a measurement whose numbers are no numbers fails and leaves no result."""
+"""A training, a sweep or a measurement whose numbers are not numbers fails and leaves no result."""
 
 import json
 import math
@@ -59,7 +59,7 @@ def data(trained: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def diverging(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The loss of the third batch is no number."""
+    """The loss of the third batch is not a number."""
     calls = 0
 
     def loss(*arguments, **options):

@@ -108,7 +108,7 @@ def test_jobs_that_differ_in_their_seed_have_a_mean(
 
 
 def test_seeds_are_compared_one_by_one() -> None:
-    """What a seed does to all alike is no part of the difference's error."""
+    """What a seed does to all alike is not part of the difference's error."""
     labels = ["old", "old", "old", "new", "new", "late"]
     seeds = ["0", "1", "2", "1", "0", "7"]
     psnr = [20.0, 22.0, 27.0, 22.5, 20.3, 19.0]

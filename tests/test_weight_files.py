@@ -147,7 +147,7 @@ def test_weights_without_permission_are_not_called_damaged(tmp_path, closed):
 
 def test_a_pipe_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "net.pth")
-    refused(weight_file(tmp_path / "net.pth"), "is no regular file")
+    refused(weight_file(tmp_path / "net.pth"), "is not a regular file")
 
 
 def _zipped_again(path: Path, compression: int) -> None:
@@ -177,8 +177,8 @@ def test_a_shape_of_more_numbers_than_the_file_holds_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("odd", "said"),
     [
-        (torch.zeros(2, 3).to_sparse(), "is no plain tensor"),
-        (torch.quantize_per_tensor(torch.zeros(2, 3), 0.1, 0, torch.qint8), "is no plain tensor"),
+        (torch.zeros(2, 3).to_sparse(), "not a plain tensor"),
+        (torch.quantize_per_tensor(torch.zeros(2, 3), 0.1, 0, torch.qint8), "not a plain tensor"),
         (torch.zeros(2, 3, dtype=torch.int64), "of another type (0.weight: torch.int64"),
         (torch.zeros(2, 3, dtype=torch.complex64), "of another type (0.weight: torch.complex64"),
     ],

@@ -20,16 +20,16 @@ from extrap_train.gaussians.training_scene import TrainingScene
 from extrap_train.views import Camera
 
 _HARD_OPACITY = 0.95
-"""Of every Gaussian in hard depth steps."""
+"""Opacity of every Gaussian in hard depth steps."""
 _LOCAL_WEIGHT, _GLOBAL_WEIGHT = 0.1, 1.0
-"""Of depth normalised by the patch, and by the image."""
+"""Weights of the losses on depth normalised by the patch, and by the image."""
 _DEPTH_TOLERANCE = 0.01
 """Smaller differences of depth are let be."""
 _SMALLEST_PATCH, _LARGEST_PATCH = 5, 17
 """Sides in pixels; each term draws its own."""
 _COARSEST_CELLS, _FINEST_CELLS, _BOUND = 16, 512, 3.0
-"""Of the hash grid: cells along the coarsest level, cells per extent along the finest, and half the
-side of its cube in extents.
+"""The hash grid's cells along its coarsest level, its cells per extent along the finest, and half
+the side of its cube in extents.
 """
 _GRID_RATE, _NETWORK_RATE = 5e-3, 5e-4
 

@@ -46,7 +46,7 @@ class IncrementalDiffusion(Diffusion):
         queries = [Query(name, cameras[index]) for index, name in enumerate(names)]
         steps: list[Step] = []
         known = complete(known, queries, pipeline, lambda _, __, step: steps.append(step))
-        # Of every view the attempt that the map kept, as it was generated.
+        # For every view, the attempt that the map kept, as it was generated.
         seeds = {v.view.name: v.origin.seed for v in known.views if v.origin.kind == GENERATED}
         agreeing = [s for s in steps if s.agreement >= options.confidence.least_agreement]
         return Synthesis(

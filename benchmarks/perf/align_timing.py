@@ -20,7 +20,7 @@ KNOWN_ANGLES_DEG = (-50.0, -30.0, -15.0, 15.0, 30.0, 50.0)
 REPEATS = 2
 STEPS = 300
 LEARNING_RATE = 0.01
-"""Of the reference."""
+"""Adam's steps and learning rate in the reference."""
 
 Noise = Callable[[Float[Tensor, "h w"], torch.Generator], Float[Tensor, "h w"]]
 """A depth map and what a source would make of it."""

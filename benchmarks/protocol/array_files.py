@@ -45,7 +45,7 @@ Positive = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 def sha256_of(file: Path) -> str | None:
-    """Of a file's content; None where there is no such file, or one larger than any of ours."""
+    """SHA-256 of a file's content; None if it does not exist or is larger than any of ours."""
     if not _is_usual(file):
         return None
     with file.open("rb") as content:
@@ -110,7 +110,7 @@ def array_of(content: bytes, shape: tuple[int | None, ...], file: Path) -> Tenso
             raise ValueError(f"{dtype} of shape {found}")
     except ARRAY_ERRORS as error:
         reason = " ".join(str(error).split())[:200]
-        raise InputError(f"{file}: is no such array ({reason}); run the table again") from None
+        raise InputError(f"{file}: is not such an array ({reason}); run the table again") from None
     values = torch.from_numpy(np.frombuffer(stream.read(), np.float32).copy())
     if not values.isfinite().all():
         raise InputError(f"{file}: holds numbers that are not finite; run the table again")

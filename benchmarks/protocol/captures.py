@@ -33,7 +33,7 @@ from extrap_train.store.records import read_record
 from extrap_train.views import stack_poses
 
 CLOUD_POINTS = 20_000
-"""Of the true surface of a rendered scene."""
+"""Points sampled on the true surface of a rendered scene."""
 
 
 @dataclass(frozen=True)

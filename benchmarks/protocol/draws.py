@@ -55,7 +55,7 @@ class Protocol:
 
     @property
     def sha256(self) -> str:
-        """Of the whole content: every result carries it."""
+        """SHA-256 of the whole content, which every result carries."""
         return digest(asdict(self))
 
     @classmethod

@@ -133,7 +133,7 @@ class Scene:
 
     @property
     def data_hash(self) -> str:
-        """Of every file and camera in it."""
+        """Hash of every file and camera in the scene."""
         kept = asdict(self.record)
         return digest([kept[part] for part in ("draw", "inputs", "targets", "files")])
 

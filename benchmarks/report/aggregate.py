@@ -1,7 +1,7 @@
 """A table's results as data frames: every number, the means with intervals, and what captures tell
 beyond chance.
 
-A value is a capture's: its draws and seeds are averaged before, for they are no further samples.
+A value is a capture's: its draws and seeds are averaged before, for they do not count as samples.
 """
 
 import math
@@ -31,7 +31,7 @@ UNIT = ["category", "sequence", "draw", "seed"]
 CELL = ["method", *UNIT, "n_views"]
 """What names a cell."""
 CAPTURE = ["category", "sequence"]
-"""What counts as a sample: draws and seeds of one capture are no further ones."""
+"""What counts as a sample: draws and seeds of one capture do not count."""
 MEANS = [
     "method", "draw", "n_views", "metric", "mean", "low", "high", "captures", "cells", "of", "rank",
     "p_best", "behind_best",

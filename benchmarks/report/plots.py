@@ -70,7 +70,7 @@ def _over_angle(part: pd.DataFrame, metric: str, results: Results) -> str:
 
 def binned(images: pd.DataFrame) -> pd.DataFrame:
     """One row per interval of angles, by its `center`: mean over captures, its standard error (NaN
-    for a single one) and the count of `captures`. Images of one capture are no further samples.
+    for a single one) and the count of `captures`. Images of one capture do not count as samples.
     """
     center = ((images["angle_deg"] // _BIN_DEG + 0.5) * _BIN_DEG).rename("center")
     by_capture = images["value"].groupby([center, *(images[name] for name in CAPTURE)]).mean()

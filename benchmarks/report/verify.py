@@ -113,7 +113,7 @@ def _protocol_problems(results: Results, made: Sequence[tuple[str, Draw]]) -> It
     yield from (f"{row}: has {count} cells" for row, count in counts.items() if count > 1)
     for name, draw in made:
         if expected.get(row := f"{name} on {draw.label}") != draw:
-            yield f"{row}: is no row and draw of the table"
+            yield f"{row}: is not a row and draw of the table"
 
 
 def _report_problems(results: Results) -> Iterator[str]:

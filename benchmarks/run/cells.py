@@ -209,7 +209,7 @@ class CellJob:
 
 
 def failed_output(reason: str) -> CheckedOutput:
-    """In place of the output of a method, or of a scoring, that gave none."""
+    """The output of a method, or of a scoring, that gave none."""
     return CheckedOutput(MethodOutput(status=FAILED, reason=reason))
 
 

@@ -106,8 +106,8 @@ def judging_files(scoring: ScoringConfig) -> Mapping[str, Path]:
 
 @lru_cache
 def sources_digest(places: tuple[str, ...], module: str = "") -> str:
-    """Of the Python files in some places of this project, and of those of a module from elsewhere:
-    all below the folder that its import begins at, as a folder given with `--config-dir`.
+    """Digest of the Python files in `places` of this project, and of those of `module`, which may
+    come from elsewhere: all below the folder that its import begins at (as with `--config-dir`).
     """
     files = [file for place in places for file in _sources(_ROOT / place)]
     if module and not module.startswith("benchmarks."):

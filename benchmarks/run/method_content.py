@@ -21,7 +21,7 @@ from extrap_train.jobs.isolated import IsolatedLauncher
 from extrap_train.store.digests import file_digest
 
 MISSING_WEIGHTS = "missing: "
-"""What stands in place of the digest of weights that nobody knows, before the reason."""
+"""Prefix of the reason that stands instead of the digest of weights that nobody knows."""
 _OURS = "benchmarks."
 
 
@@ -95,7 +95,7 @@ def _read_answer(answer: bytes | Died, categories: Sequence[str]) -> MethodConte
 
 
 def _weights_digest(method: Method, category: str) -> str:
-    """Of a method's weight files, in their order; where they lie does not matter."""
+    """Digest of a method's weight files, in their order; where they lie does not matter."""
     try:
         files = weight_paths(method, category)
     except Unavailable as error:

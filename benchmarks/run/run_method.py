@@ -141,7 +141,7 @@ def _require_floats(values: Any, what: str) -> None:
 _MAX_TRACEBACK_LINES = 200
 _MAX_WORDS = 100
 MAX_POINTS = 5_000_000
-"""Of a method's surface: more take hours to score."""
+"""Most points of a method's surface: more take hours to score."""
 _RECORD, _IMAGES, _POINTS = "record", "images", "points"
 _KIND = TypeAdapter(MethodOutput)
 

@@ -182,8 +182,8 @@ def _check_inputs(config: TrainConfig) -> None:
     named = len(config.input_frames)
     if named and config.inputs is not None:
         raise InputError(
-            f"inputs={config.inputs} and input_frames ({named} frames) are both given; give only one "
-            "of them"
+            f"inputs={config.inputs} and input_frames ({named} frames) are both given; give only "
+            "one of them"
         )
     if config.task == "complete" and (named or config.inputs) == 1:
         raise InputError(

@@ -115,7 +115,7 @@ class PrepConfig:
     )
     full_circle: str = option(
         "prefer",
-        "sequences that are no full circle: drop them, drop them if others are one, or keep them",
+        "sequences that are not a full circle: drop all, drop all if others are one, or keep them",
         known=("require", "prefer", "ignore"),
     )
     correct: bool | None = option(

@@ -15,7 +15,7 @@ from extrap_train.errors import InputError
 MISSING: Any = "???"  # OmegaConf's mark for "must be given"
 _PATHS = ("root", "checkpoint", "depth_network")
 _PATHS_OR_NAMES = ("model", "start")
-"""What is no path here is the name of weights in the package or in a cache of downloads."""
+"""What is not a path here is the name of weights in the package or in a cache of downloads."""
 PACKAGED_MODELS = Path(__file__).parents[1] / "weights"
 """Folder of the models that come with the package."""
 MODEL_CONFIG = "extrapolation_model.json"

@@ -162,7 +162,7 @@ class CompletionConfig:
     )
     held_out: int = option(
         20,
-        "most photographs that are no inputs and are compared with views at their poses",
+        "most photographs that are not inputs and are compared with views at their poses",
         low=0,
     )
     dry_run: bool = option(False, "print and draw the plan, and stop")

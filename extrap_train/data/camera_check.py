@@ -32,11 +32,13 @@ PARALLEL_RAD = np.deg2rad(15)
 WIDE_RAD = np.deg2rad(20)
 """Axes that differ by more prove that cameras stand around what they look at."""
 LEAST_APART = 1e-4
-"""Of the cameras' distance from the origin: below it single precision blurs their places."""
+"""Least distance between cameras, as a share of their distance from the origin: below it single
+precision blurs their places."""
 ONE_PLACE = 1e-6
 """In scene units."""
 LEAST_SHARE, NEARLY_ALL = 1 / 3, 0.9
-"""Of cameras that look at one point: too few below it, and enough to name a convention."""
+"""Shares of cameras that look at one point: too few below the first, enough from the second on to
+name a convention."""
 CLEARLY_RAD = np.deg2rad(5)
 """By so much, and twofold, must another convention bring the axes nearer to one point."""
 
@@ -44,14 +46,15 @@ ROTATION_TOLERANCE = 1e-3
 """Largest deviation of R Rᵀ from the identity; rotations stored as float32 stay below 1e-5."""
 
 FOCAL_SIDES = (1e-3, 1e4)
-"""Of focal lengths, in sides of the picture; a crop may be a small part of its photograph."""
+"""Range of focal lengths, in sides of the picture; a crop may be a small part of its photograph."""
 CENTRE_SIDES = 1e3
 """How far outside of the picture the principal point of a crop may lie, in its sides."""
 
 SHORTEST_FOCAL, LONGEST_FOCAL = 0.2, 20.0
-"""Of a photograph: in its shorter side, which a circular fisheye fills, and in its longer one."""
+"""Range of a photograph's focal length: the shortest in its shorter side, which a circular fisheye
+fills, the longest in its longer one."""
 LARGEST_OFFSET = 0.25
-"""Of a photograph's principal point from its middle, as a share of each side."""
+"""Largest offset of a principal point from the photograph's middle, as a share of each side."""
 NORMALISED_FOCAL = 5.0
 """In pixels: a photograph's focal length below it is one in widths."""
 

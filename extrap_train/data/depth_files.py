@@ -39,7 +39,7 @@ class DepthFile:
     scale: float
     """Scene units per unit of the file."""
     mask_path: str | None = None
-    """Of a picture that shows which of the depths to trust."""
+    """Path of a picture that shows which of the depths to trust."""
     is_half_float: bool = False
     """Whether the 16 bits of its pixels are CO3D's float16, no whole numbers."""
 
@@ -85,7 +85,7 @@ def _read_npy(path: Path, size: tuple[int, int]) -> Shaped[np.ndarray, "h w"]:
         # Mapped, not read: the header may promise any size.
         raw: np.ndarray = np.lib.format.open_memmap(path, mode="r")
     except ARRAY_ERRORS as error:
-        raise InputError(f"{path}: is no array of numbers ({error}); restore it") from None
+        raise InputError(f"{path}: is not an array of numbers ({error}); restore it") from None
     if raw.ndim == 3 and raw.shape[2] == 1:
         raw = raw[..., 0]
     fits = raw.ndim == 2 and 0 < raw.size <= MAX_PIXELS and same_view(raw.shape, size)

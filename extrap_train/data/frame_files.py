@@ -25,7 +25,8 @@ from extrap_train.store.records import read_record
 from extrap_train.views import Camera, View
 
 FLOWS = "flows.npy"
-"""Of the pairs of one sequence, beside their table: control vectors (`geometry.spline_flow`)."""
+"""File beside the table of a sequence's pairs, with their control vectors
+(`geometry.spline_flow`)."""
 FRAMES, CAMERAS = "frames.npy", "frames.parquet"
 """A sequence's encoded frames (`frame_codec`), one after the other, and their table."""
 REMEDY = "run data_prep again, which makes what is damaged once more"
@@ -73,7 +74,7 @@ class StoredFrames:
 
     @property
     def depth_share(self) -> Float[np.ndarray, " n"]:
-        """Of each frame's pixels, how many have a depth."""
+        """Share of each frame's pixels that have a depth."""
         return self._table["depth_share"].to_numpy()
 
     @property
@@ -123,7 +124,7 @@ def map_array(file: Path) -> np.ndarray:
         reason = " ".join(str(error).split())[:200]
         raise damaged_error(file.parent, f"{file.name}: {reason}") from None
     if not isinstance(mapped, np.memmap):  # a zip archive
-        raise damaged_error(file.parent, f"{file.name} is no array")
+        raise damaged_error(file.parent, f"{file.name} is not an array")
     return mapped
 
 

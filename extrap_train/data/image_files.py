@@ -55,7 +55,7 @@ _MOST_ROUNDING = 0.05
 _HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 
 log = logging.getLogger(__name__)
-# Of damaged EXIF, or sizes below the limit here: what matters is said in one line by this module.
+# Pillow warns of damaged EXIF and of sizes below the limit here; this module reports what matters.
 warnings.filterwarnings("ignore", module=r"PIL\.")
 
 

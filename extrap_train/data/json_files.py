@@ -13,9 +13,9 @@ from extrap_train.data.paths import require_file
 from extrap_train.errors import InputError
 
 MAX_JSON_BYTES = 64 * 2**20
-"""Of a file that is parsed whole: parsed, JSON takes up to thirty times the room of its text."""
+"""Largest file that is parsed whole: in memory JSON takes up to thirty times its text."""
 MAX_ENTRY_BYTES = 64 * 2**10
-"""Of one entry of a list that is read entry by entry; CO3D's have two thousand."""
+"""Largest entry of a list that is read entry by entry; CO3D's have two thousand bytes."""
 GZIP_FLOOR_BYTES = 32 * 2**20
 GZIP_RATIO = 40
 """Annotations shrink to between a third and a tenth; a decompression bomb, to a thousandth."""
@@ -68,7 +68,7 @@ class _Text:
         self._text, self._at = "", 0
 
     def peek(self) -> str:
-        """The next character that is no space; empty at the end."""
+        """The next character that is not a space; empty at the end."""
         while True:
             while len(self._text) - self._at <= MAX_ENTRY_BYTES:
                 if not (piece := next(self._pieces, "")):

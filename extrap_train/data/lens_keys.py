@@ -155,7 +155,7 @@ def _is_fisheye(entry: dict[str, Any], model: Any) -> bool:
 def _require_zero(coefficients: dict[str, float], keys: tuple[str, ...], whose: str) -> None:
     for key in keys:
         if coefficients.get(key):
-            raise ValueError(f"{key} is no coefficient of {whose}, but {coefficients[key]}")
+            raise ValueError(f"{key} is not a coefficient of {whose}, but {coefficients[key]}")
 
 
 def _says_something(value: Any) -> bool:

@@ -53,7 +53,7 @@ class ListedFiles:
         """What is there instead of a file that was not found."""
         path = normal_path(listed)
         if os.path.lexists(self.root / path):
-            return f"{path} is no regular file"
+            return f"{path} is not a regular file"
         folder, name = posixpath.split(path)
         looked_in = {folder: None, "": None, "images": None}
         for place in looked_in:

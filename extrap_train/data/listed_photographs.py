@@ -27,7 +27,7 @@ from extrap_train.geometry.lens import Lens
 from extrap_train.views import Camera, stack_poses
 
 MAX_FRAMES = 100_000
-"""Of a capture; more are no capture of one scene."""
+"""Most frames of a capture; more are not a capture of one scene."""
 
 log = logging.getLogger(__name__)
 
@@ -51,7 +51,7 @@ class Listed:
     """An entry of a description."""
 
     path: str
-    """Of its picture, as it stands there; it has passed `check_relative`."""
+    """Path of the picture, as it is listed; it has passed `check_relative`."""
     describe: Callable[[str], ListedPhotograph]
     """The photograph, by the path at which the picture was found; InputError where the entry cannot
     be used."""

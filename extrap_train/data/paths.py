@@ -12,7 +12,7 @@ from pathlib import Path
 from extrap_train.errors import InputError
 
 MAX_NAME_BYTES = 255
-"""Of a file or folder, on every common file system."""
+"""Longest name of a file or folder on every common file system."""
 MAX_PATH_BYTES = 4095
 # Absolute, on a Windows drive, with a `..` among its parts, or with a NUL that would end it early.
 _LEAVES_FOLDER = re.compile(r"^[/\\]|^[A-Za-z]:|(^|[/\\])\.\.([/\\]|$)|\0")
@@ -31,7 +31,7 @@ def check_relative(relative: str, file: Path) -> str:
             "only paths below the data set's root can be read: correct the entry"
         )
     if _UNPRINTABLE.search(relative):
-        raise InputError(f"{file}: the path {relative[:60]!a} is no plain text; correct the entry")
+        raise InputError(f"{file}: the path {relative[:60]!a} is not plain text; correct the entry")
     encoded = os.fsencode(relative)
     if len(encoded) > MAX_PATH_BYTES or max(map(len, encoded.split(b"/"))) > MAX_NAME_BYTES:
         raise InputError(f"{file}: the path {relative[:60]!r}… has too long a name; correct it")
@@ -53,7 +53,7 @@ def require_file(path: Path) -> Path:
         reason = error.strerror if isinstance(error, OSError) else "no valid path"
         raise InputError(f"{path}: cannot be read ({reason}); correct the entry") from None
     if not stat.S_ISREG(mode):
-        raise InputError(f"{path}: is no regular file; put the file itself there")
+        raise InputError(f"{path}: is not a regular file; put the file itself there")
     return path
 
 

@@ -225,7 +225,7 @@ class PreparedData:
         return torch.from_numpy(chosen)
 
     def _read_flow_numbers(self, sequence: str) -> Int[np.ndarray, "n n"]:
-        """By reference and query; what is no training pair is less than `UNTOUCHED`."""
+        """By reference and query; pairs that are not for training have less than `UNTOUCHED`."""
         frames = self._rows[sequence]
         numbers = np.full(2 * (frames.stop - frames.start,), UNTOUCHED - 1, np.int32)
         rows = self._pairs.iloc[self._pair_rows.get(sequence, slice(0, 0))]
@@ -261,7 +261,7 @@ def read_preparation(folder: Path) -> dict[str, Any]:
     manifest = read_record(file, _Manifest, REMEDY)
     size = manifest.options.get("image_size")
     if manifest.format != FORMAT or type(size) is not int:
-        raise damaged_error(folder, f"{file} is no manifest of format {FORMAT}")
+        raise damaged_error(folder, f"{file} is not a manifest of format {FORMAT}")
     return asdict(manifest)
 
 

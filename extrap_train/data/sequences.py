@@ -54,7 +54,7 @@ class Photograph:
     root: Path
     name: str
     camera: Camera
-    """Of the undistorted photograph."""
+    """Camera of the undistorted photograph."""
     image_path: str
     mask: Path | None = None
     depth: DepthFile | None = None

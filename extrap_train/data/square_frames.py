@@ -25,11 +25,11 @@ from extrap_train.views import View, stack_cameras, stack_poses
 HELD_OUT_EVERY = 5
 """A lone sequence holds out every fifth frame."""
 LEAST_KNOWN_SHARE = 0.25
-"""Of the finer depths under a pixel, for it to have one."""
+"""Least share of known depths under a pixel of the coarser map for it to have one."""
 MOST_UNUSABLE_SHARE = 0.1
-"""Of a sequence's frames, beyond which the whole sequence is not trusted."""
+"""Share of unusable frames beyond which the whole sequence is not trusted."""
 LEAST_FRAMES = 2
-"""While so many are left, one unusable frame alone is no reason not to trust a sequence."""
+"""While so many are left, one unusable frame alone does not discredit a sequence."""
 FRAMES_VERSION = 3
 """Raised whenever the same photographs give other frames."""
 LOG = logging.getLogger(__name__)
@@ -40,11 +40,11 @@ class CaptureKeys:
     """Hashes that tell captures apart without reading any photograph."""
 
     content: str
-    """Of names and cameras: the same wherever the capture lies."""
+    """Digest of names and cameras: the same wherever the capture lies."""
     files: str
-    """Of sizes and times of the photographs, masks and depth maps."""
+    """Digest of sizes and times of the photographs, masks and depth maps."""
     sizes: str
-    """Of their sizes alone: the same for a copy."""
+    """Digest of their sizes alone: the same for a copy."""
 
     @classmethod
     def of(cls, sequence: FrameSequence) -> "CaptureKeys":

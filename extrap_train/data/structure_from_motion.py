@@ -17,13 +17,14 @@ if TYPE_CHECKING:
     import pycolmap
 
 MAX_SIDE = 1200
-"""Of the pictures that features are found in, in pixels."""
+"""Longer side of the pictures that features are found in, in pixels."""
 MAX_FEATURES = 4096
-"""Of one picture; the time of matching grows with its square."""
+"""Most features of one picture; the time of matching grows with their square."""
 EXHAUSTIVE = 100
-"""Up to so many pictures every two are matched."""
+"""Up to this many pictures, every pair is matched."""
 NEIGHBOURS = 10
-"""Of more, each is matched with so many that follow it, and with those 16, 32, … places on."""
+"""Of more pictures, each is matched with this many that follow it, and with those 16, 32, … places
+later."""
 CLEARLY_BETTER = 0.992
 """Distortion, and a principal point off the middle, must each lower the mean reprojection error to
 this share: few pictures hardly tell them from a turn of the cameras."""
@@ -37,12 +38,12 @@ class SharedCamera:
     """Pictures that one camera and lens took."""
 
     names: list[str]
-    """Of the photographs."""
+    """Names of the photographs."""
     files: list[str]
     """The grey pictures in the job's folder, smaller by up to `MAX_SIDE`."""
     height: int
     width: int
-    """Of the photographs, in pixels, turned upright."""
+    """Size of the photographs, in pixels, turned upright."""
     focal: float | None
     """In pixels of the grey pictures, if the photographs tell it."""
 
@@ -173,7 +174,7 @@ def _adjust(model: "pycolmap.Reconstruction", options: "pycolmap.BundleAdjustmen
 
 
 def _restore_photographs(model: "pycolmap.Reconstruction", cameras: Sequence[SharedCamera]) -> None:
-    """Names and pixels of the photographs in place of those of the grey pictures."""
+    """Names and pixels of the photographs instead of those of the grey pictures."""
     names = {f: name for c in cameras for f, name in zip(c.files, c.names, strict=True)}
     scales = {}
     for number, found in model.cameras.items():

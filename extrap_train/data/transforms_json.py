@@ -34,9 +34,9 @@ KEYS = LENS_KEYS | {
     *("w", "h", "transform_matrix", "mask_path", "ply_file_path", "applied_scale"),
     *("depth_file_path", "depth_unit_scale_factor", "depth_path", "integer_depth_scale"),
 }
-"""Of what stands for all frames, what is looked at."""
+"""Entries read from the top level, where they hold for all frames."""
 LAST_ROW_TOLERANCE = 1e-6
-"""Of a matrix's last row, relative to its last number."""
+"""Tolerance on a matrix's last row, relative to its last number."""
 
 
 def read_transforms(folder: Path) -> FrameSequence:
@@ -72,7 +72,7 @@ def read_cameras(file: Path) -> tuple[list[str], Camera]:
 
     Every entry needs a `transform_matrix` and, itself or for all, the size `w`, `h` and a lens. All
     entries must have one size. Raises InputError that names the entry otherwise, or where a name
-    is no path below a folder.
+    is not a path below a folder.
     """
     content, entries = _read_entries(file)
     names, cameras = [], []

@@ -32,12 +32,12 @@ class PointMaps:
     second: Float[Tensor, "h2 w2 3"]
     first_confidence: Float[Tensor, "h w"]
     second_confidence: Float[Tensor, "h2 w2"]
-    """Not negative; 0 where the point means nothing. Ranks pixels, is no probability."""
+    """Not negative; 0 where the point means nothing. Ranks pixels, is not a probability."""
 
 
 @dataclass(frozen=True)
 class DepthMap:
-    """Depth of one view (0 = unknown) with its confidence (0 = unknown, higher is surer)."""
+    """Depth of one view (0 = unknown) with its confidence (0 = unknown, higher is more certain)."""
 
     depth: Float[Tensor, "h w"]
     confidence: Float[Tensor, "h w"]

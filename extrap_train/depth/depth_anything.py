@@ -143,7 +143,7 @@ def _settings(model: str, file: Path) -> dict[str, Any]:
     except (ValueError, RecursionError):
         raise _refusal(model, f"{file.name} is not valid JSON") from None
     if not isinstance(settings, dict):
-        raise _refusal(model, f"{file.name} is no table of settings")
+        raise _refusal(model, f"{file.name} is not a table of settings")
     return settings
 
 

@@ -17,7 +17,8 @@ NEAREST_RAD, FARTHEST_RAD = math.radians(6), math.radians(18)
 LEAST_RAD, LIMIT_RAD = math.radians(3), math.radians(45)
 """Outside, views never help in stereo: those of the same place agree at any depth."""
 ROUNDING = 2e-6
-"""Of the cameras' distance from the origin: what rounding alone makes of one place."""
+"""Distance, as a share of the cameras' distance from the origin, that rounding alone puts between
+two cameras in one place."""
 
 WIDEST_RAD = math.radians(90)
 """Limit of what matchers and learned point maps bridge."""
@@ -111,7 +112,7 @@ def _by_turns(badness: Float[Tensor, " n"], on_right: Tensor, count: int) -> lis
 NEAREST, FARTHEST = 0.3, 20.0
 """Range of depths, as multiples of the scene centre's depth."""
 WIDEST_DISPARITY = 0.25
-"""Of cameras that look the same way: largest displacement, as a share of the longer side."""
+"""Largest displacement between cameras that look the same way, as a share of the longer side."""
 LEAST_BASELINE = 1e-6
 """In scene units: cameras that are nearer to each other stand in one place."""
 LEAST_SEEN = 0.1

@@ -29,7 +29,7 @@ class Estimate:
 
     inverse_depth: Float[Tensor, "h w"]
     correlation: Float[Tensor, "h w"]
-    """Of the windows, from 0 (no better than chance, or no texture) to 1."""
+    """Correlation of the windows, from 0 (no better than chance, or no texture) to 1."""
 
 
 def sweep(view: View, neighbours: list[View], bounds: tuple[float, float], planes: int) -> Estimate:
@@ -195,6 +195,6 @@ def _shift(path: Float[Tensor, "2 lanes d"], shift: int) -> Float[Tensor, "2 lan
 def _jump_penalty(
     image: Float[Tensor, "3 h w"], row_step: int, column_step: int
 ) -> Float[Tensor, "h w"]:
-    """Of a path that comes to each pixel by this step."""
+    """The penalty for a jump on a path that comes to each pixel by this step."""
     contrast = (image - image.roll((row_step, column_step), (1, 2))).abs().mean(0)
     return (JUMP / (1 + contrast / EDGE_CONTRAST)).clamp_min(1.5 * SMALL_STEP)

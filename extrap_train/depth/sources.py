@@ -56,7 +56,7 @@ def depth_source(config: DepthConfig, device: torch.device | None = None) -> Dep
             )
             return own
         case _:
-            raise InputError(f"depth={config.name}: is no depth source that this project knows")
+            raise InputError(f"depth={config.name}: is not a depth source that this project knows")
 
 
 def weight_files(options: object) -> list[Path]:

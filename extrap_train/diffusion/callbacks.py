@@ -99,7 +99,7 @@ class StepProgress(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Advance, and stop with a clear word if the loss is no number any more."""
+        """Advance, and stop with a clear word if the loss is not a number any more."""
         self._loss, note = outputs["loss"], None
         now = time.monotonic()
         if self._loss.device.type == "cpu" or now - self._read_at >= DRAWN_EVERY_S:
@@ -114,7 +114,7 @@ class StepProgress(Callback):
     def on_save_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Save no weights after a loss that is no number: weights that it has reached stay none."""
+        """Save no weights after a loss that is not a number: those that it has reached stay NaN."""
         self._finite_loss(trainer)
 
     def _finite_loss(self, trainer: Trainer) -> float:

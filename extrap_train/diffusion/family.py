@@ -74,7 +74,7 @@ class MegaScenes(Family):
         """See `Family.latents`."""
         reference, base = super().latents(batch, autoencoder, config)
         warp = _nearest_warp(batch)
-        # What is no network keeps its precision where the caller lets the network run in less.
+        # What is not a network keeps its precision where the caller lets the network run in less.
         with torch.autocast(reference.device.type, enabled=False):
             shrunk = lanczos_resize(warp.image, *reference.shape[-2:]).clamp(0, 1) * 2 - 1
         if config.residual:

@@ -25,7 +25,7 @@ _WEIGHTS = "adapter_model.safetensors"
 _OPTIONS = "adapter_config.json"
 _BASE = "base.json"
 """An `AdapterRecord`, next to peft's files."""
-_REMEDY = "{} is no adapter folder of task=scene, or is damaged: make it again"
+_REMEDY = "{} is not an adapter folder of task=scene, or is damaged: make it again"
 _MAX_RANK = 1024
 
 _Target = Literal["to_q", "to_k", "to_v", "to_out.0", "conv1", "conv2"]

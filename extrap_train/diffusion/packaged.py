@@ -68,7 +68,7 @@ def restore(
     """What `compress` made its tensors from, as near as four bits come; those called in `shapes`.
 
     Names that neither hold are left out: whoever loads the result sees what is missing. Raises
-    ValueError for bits and scales that are no difference to the base's tensor.
+    ValueError for bits and scales that do not describe a difference to the base's tensor.
     """
     state = {name: value for name, value in tensors.items() if name in shapes}
     for name in shapes:

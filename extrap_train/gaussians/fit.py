@@ -21,13 +21,14 @@ from extrap_train.terminal import track
 from extrap_train.views import Camera, View
 
 WIDEST_START = 0.05
-"""Of the distance to the nearest input camera: among a few hundred scattered points neighbours are
-so far that each Gaussian would cover a whole image, which is slow and shows nothing.
+"""Largest initial width as a share of the distance to the nearest input camera: among a few hundred
+scattered points neighbours are so far that each Gaussian would cover a whole image, which is slow
+and shows nothing.
 """
 FARTHEST = 1e5
 """Distance from the scene's centre, in extents, that no Gaussian reaches on purpose."""
 SURFACE_ALPHA = 0.5
-"""Of a pixel that shows a surface; with less, most of what it shows is behind the Gaussians."""
+"""Least opacity of a pixel that shows a surface; with less it shows mostly what is behind."""
 
 
 class Diverged(InputError):

@@ -35,7 +35,8 @@ _MIN_SPACING = 1e-7**0.5
 FARTHEST = 10.0
 """Greatest depth of random points, as a multiple of the scene centre's depth."""
 NEAREST_UNKNOWN = 0.5
-"""Least one, in the same, where the inputs do not tell (`nearest_expected`)."""
+"""Least depth of random points, as a multiple of the scene centre's depth, where the inputs do not
+tell (`nearest_expected`)."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,7 @@ MIN_SIDE = 512
 """Smaller photographs are enlarged to this longer side first: SIFT needs room for its octaves."""
 CONTRAST_THRESHOLD = 0.02
 RATIO = 0.8
-"""Of Lowe's test."""
+"""Largest ratio of the nearest and second nearest distance in Lowe's test."""
 EPIPOLAR_SHARE = 0.006
 """Farthest a match may lie from its epipolar line, as a share of the longer side."""
 

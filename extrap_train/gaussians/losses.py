@@ -66,7 +66,7 @@ def photometric_loss(
 
 _MIN_SPREAD = 1e-6
 _GLOBAL_SHARE = 0.01
-"""Of the image's spread that a patch's own is raised by (DNGaussian, released code)."""
+"""Share of the image's spread that is added to a patch's own (DNGaussian, released code)."""
 
 
 def pearson(first: Float[Tensor, " n"], second: Float[Tensor, " n"]) -> Float[Tensor, ""]:

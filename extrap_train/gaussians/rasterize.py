@@ -22,7 +22,7 @@ _LOG = logging.getLogger(__name__)
 
 
 class _Announcer(Listener):
-    """Logs one line when numba compiles for the first time; loading from its cache is no event."""
+    """Logs one line when numba compiles for the first time, none when it loads from its cache."""
 
     def __init__(self) -> None:
         self.silent = False

@@ -65,7 +65,7 @@ class Recipe:
         self.background = BACKGROUNDS[options.background]
         self._rasterize = rasterizer(options.rasterizer)
         self.cameras = [view.camera.to(options.device) for view in scene.views]
-        """Of the inputs, where the fit runs; `scene` stays on the CPU."""
+        """The inputs' cameras on the device of the fit; `scene` stays on the CPU."""
         self._photographs = [photograph(view.image.to(options.device)) for view in scene.views]
 
     def initial_points(self) -> Points:
@@ -103,7 +103,7 @@ class Recipe:
         return cameras
 
     def colors(self, parameters: GaussianParameters, camera: Camera) -> Float[Tensor, "n 3"] | None:
-        """Colours in place of the spherical harmonics."""
+        """Colours instead of the spherical harmonics, or None."""
         return None
 
     def baked(self, parameters: GaussianParameters) -> GaussianParameters:

@@ -170,7 +170,7 @@ def _procrustes(
 def _trust(spread: Float[Tensor, " e"], usable: Bool[Tensor, " e"]) -> Float[Tensor, " e"]:
     """Less for an edge that fits far worse than most do; no more for one that fits better.
 
-    A good fit to the known view is no proof: smooth errors vanish in it and stay in the new one.
+    A good fit to the known view proves nothing: smooth errors vanish in it and stay in the new one.
     """
     median = _strided_median(spread[None], usable[None])
     return 1 / (1 + (spread / (_FAR_WORSE * median.clamp(min=_LEAST_SPREAD))).square())

@@ -12,7 +12,7 @@ MAX_ZOOM = 4.0
 _BORDER_SAMPLES = 64
 _RAY_SAMPLES = 64
 _RAY_STEP = 1e-4
-"""Of a ray's length, over which the lens's radial derivative is taken."""
+"""Share of a ray's length over which the lens's radial derivative is taken."""
 _BISECTIONS = 24
 _OPENCV_CENTRE = 0.5
 """OpenCV puts the top-left pixel's centre at (0, 0), we at (0.5, 0.5)."""

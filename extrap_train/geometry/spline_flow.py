@@ -14,7 +14,7 @@ from extrap_train.geometry.resample import sample_pixels
 STIFFNESS = 1e-5
 """Weight of the field's second differences against one per match: decides only where none are."""
 OUTLIER_MADS = 3.0
-"""Residuals beyond this many robust standard deviations are no part of a smooth motion."""
+"""Residuals beyond this many robust standard deviations are not part of a smooth motion."""
 MEDIAN_TO_SIGMA = 1 / 1.1774
 """The median length of a residual in the plane is 1.1774 sigma where its two parts are normal."""
 LEAST_SIGMA = 1e-3

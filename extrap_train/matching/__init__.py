@@ -23,7 +23,7 @@ class Matches:
     first: Float[Tensor, "n 2"]
     second: Float[Tensor, "n 2"]
     confidence: Float[Tensor, " n"]
-    """In (0, 1]. Ranks matches of one matcher; is no probability, nor comparable between two."""
+    """In (0, 1]. Ranks matches of one matcher; is not a probability, nor comparable between two."""
 
     @property
     def first_to_second(self) -> Float[Tensor, "n 2"]:

@@ -13,9 +13,9 @@ from extrap_train.matching import Matches, is_known_at, resize, to_image_pixels
 from extrap_train.weight_files import WeightFile
 
 LARGEST_RATIO = 0.9
-"""Of the distances to the nearest and the second nearest descriptor, in both directions."""
+"""Largest ratio of the distances to the nearest and second nearest descriptor, both ways."""
 CONSTANTS = ("dkd.hw_grid",)
-"""Of the detector: part of its state, but not of the published file."""
+"""The detector's constants: part of its state, but not of the published file."""
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,9 @@ from extrap_train.matching import Matches, is_known_at, resize, to_grey, to_imag
 from extrap_train.weight_files import WeightFile
 
 STRIDE = 8
-"""Of the coarse grid: both sides of a picture are multiples of it."""
+"""Pixels per cell of the coarse grid: both sides of a picture are multiples of it."""
 PREFIX = "matcher."
-"""Of every name in files that its trainer wrote."""
+"""Prefix of every name in files that LoFTR's trainer wrote."""
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ def matcher(
             own: Matcher = make_object(config.factory, config.options, name, Matcher, prefix)
             return own
         case _:
-            raise InputError(f"{option}={config.name}: is no matcher that this project knows")
+            raise InputError(f"{option}={config.name}: is not a matcher that this project knows")
 
 
 def _weights(config: LoftrMatcherConfig | AlikedMatcherConfig, option: str) -> Path:

@@ -36,15 +36,16 @@ LEAST_POINTS = 8
 LEAST_PARALLAX_RAD = np.deg2rad(1.5)
 """Between two rays, for the point where they meet to be used."""
 MIDDLE, BORDER = 0.4, 0.7
-"""Of half the diagonal: within the one and beyond the other a lens is compared with itself."""
+"""Radii as shares of half the diagonal: a lens is checked within the first against beyond the
+second."""
 LENS_PIXELS, LENS_RATIO = 0.5, 3.0
 """A border whose matches lie so far off, and so many times farther than the middle's, is bent: most
 of a distortion runs along the epipolar lines of an orbit and does not show."""
 DEPTH_RATIO = 1.25
 MASK_DISAGREEMENT = 0.3
-"""Of the matched points on the object in one view or the other."""
+"""Share of the matched points in either view's mask that may be missing from the other's."""
 MASK_SHARES = (0.002, 0.95)
-"""Of a picture: a mask of less or more is no object's."""
+"""Range of an object mask's share of the picture."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class MatchedViews:
     matches: Float[np.ndarray, "n 2"]
     """In the nearest view."""
     distances: Float[np.ndarray, " n"]
-    """Of the matches from the epipolar lines of the pixels, in pixels."""
+    """Distance of each match from the epipolar line of its pixel, in pixels."""
     points: Float[Tensor, "n 3"]
     """Triangulated from both; NaN where the rays meet at too small an angle or not at all."""
     third: Float[np.ndarray, "m 2"]

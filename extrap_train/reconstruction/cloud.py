@@ -41,8 +41,9 @@ class PointCloud:
 def cloud_of(known: GlobalMap, *, votes: bool = True, subdivide: int = 1) -> PointCloud:
     """All points that the views added, surfaces cut into `subdivide`² points a pixel.
 
-    With `votes`, points that surer views have looked through are left out, and the confidence of
-    the others is that of the surest view that shows them, times the share that agrees.
+    With `votes`, points that more certain views have looked through are left out, and the
+    confidence of the others is that of the most certain view that shows them, times the share
+    that agrees.
     """
     return combine(
         [_points_of(known, index, votes, subdivide) for index in range(len(known))],
@@ -79,7 +80,7 @@ def _points_of(known: GlobalMap, index: int, votes: bool, subdivide: int) -> Poi
 def _voted(
     known: GlobalMap, index: int, points: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-    """Confidence of the surest view that shows a point; share of the votes that confirm it."""
+    """Confidence of the most certain view of each point; share of the votes that confirm it."""
     own = known.views[index].confidence.flatten()
     surest, confirmed, contradicted = own, own, torch.zeros_like(own)
     for other_index in known.nearest(known.views[index].camera, MOST_COMPARED + 1):

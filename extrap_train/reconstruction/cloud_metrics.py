@@ -15,9 +15,9 @@ class CloudScores:
     """Shares in [0, 1] at one tolerance, and mean distances in scene units."""
 
     accuracy: float
-    """Of the cloud's points, those within the tolerance of the truth (precision)."""
+    """Share of the cloud's points within the tolerance of the truth (precision)."""
     completeness: float
-    """Of the truth's points, those within the tolerance of the cloud (recall)."""
+    """Share of the truth's points within the tolerance of the cloud (recall)."""
     f_score: float
     """Harmonic mean of both."""
     mean_to_truth: float
@@ -34,7 +34,7 @@ def score_cloud(
 
     `truth` lies on the object. Only points of the cloud in its bounding box, grown by a tenth of
     its largest side, are looked at, and such a point is also right on the `surroundings`: ground
-    that reaches into the box is no error. An empty cloud scores 0.
+    that reaches into the box is not an error. An empty cloud scores 0.
     """
     low, high = truth.min(0), truth.max(0)
     margin = 0.1 * (high - low).max()

@@ -11,7 +11,7 @@ from torch import Tensor
 COLOUR_SCALE = 0.06
 """Difference of colour (of a channel, in [0, 1]) that hints at another surface."""
 REACH = 0.25
-"""Of the picture's side: farther from any known pixel nothing is continued."""
+"""Share of the picture's side: farther from any known pixel nothing is continued."""
 LEAST_TIE = 1e-3
 """Between neighbours of any colours: everything is connected in the end."""
 

@@ -24,7 +24,7 @@ class ExactGenerator:
     scene: SyntheticScene
     image_size: int
     world: WorldFrame
-    """Of the map that views and queries belong to."""
+    """Frame of the map that views and queries belong to."""
 
     @property
     def warp_size(self) -> int:
@@ -52,7 +52,7 @@ class ExactDepth:
 
     scene: SyntheticScene
     world: WorldFrame
-    """Of the map that the views belong to."""
+    """Frame of the map that the views belong to."""
 
     @property
     def image_size(self) -> None:

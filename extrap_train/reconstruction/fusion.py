@@ -3,7 +3,7 @@
 Each generated view was given its depth when it came, from what was known then, and errs in its own
 way. Here its surface moves along its rays to where the views' truncated signed distances cancel
 (Curless and Levoy, A Volumetric Method for Building Complex Models from Range Images, 1996),
-sampled along the rays of the views in place of a grid.
+sampled along the rays of the views instead of on a grid.
 """
 
 from dataclasses import replace

@@ -25,7 +25,7 @@ from extrap_train.views import Camera, View
 _REMEDY = "remove it and run again to resume before it"
 _MAX_SIDE = 4096
 _BYTES_PER_PIXEL = 21
-"""Of a stored view: colours, depth and confidence in float32, a flag."""
+"""Bytes per pixel of a stored view: colours, depth and confidence in float32, a flag."""
 _RECORD_BYTES = 2**13
 
 _Index = Annotated[int, Field(ge=0)]
@@ -44,7 +44,7 @@ class _ViewRecord:
     size: Annotated[int, Field(ge=1, le=_MAX_SIDE)]
     """Side of the square, in pixels."""
     sha256: str
-    """Of NNN.safetensors."""
+    """SHA-256 of NNN.safetensors."""
     step: Step | None
 
 
@@ -170,7 +170,7 @@ def _read_tensors(path: Path, record: _ViewRecord) -> dict[str, Tensor]:
     try:
         tensors = load(content)
     except (SafetensorError, ValueError) as error:
-        raise InputError(f"{path}: is no view of a map ({error}); {_REMEDY}") from None
+        raise InputError(f"{path}: is not a view of a map ({error}); {_REMEDY}") from None
     if {name: (tuple(x.shape), x.dtype) for name, x in tensors.items()} != wanted:
         raise InputError(f"{path}: holds no view of {record.size} pixels; {_REMEDY}")
     if not all(x.isfinite().all() for x in tensors.values()):

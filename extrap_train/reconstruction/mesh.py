@@ -27,17 +27,18 @@ _REACH = 0.6
 """Half the side of the box around the centre that the cameras look at, from a distance of 1."""
 _CELL = 0.0075
 _TRUNCATION = 0.03
-"""Of depth: some four cells in the middle, so that surfaces seen aslant have whole cells, too."""
+"""Truncation of distances as a share of depth: about four cells at the middle, so that surfaces
+seen aslant have whole cells, too."""
 _MARGIN = 2
 _AT_ONCE = 2**19
 _LEAST_WEIGHT = 0.2
-"""Of all views together, below which nobody has looked."""
+"""Least weight of all views together: where it is less, space counts as unseen."""
 _COLORED_BY = 8
 """Points of the cloud: one alone may be of an outline, where colours mix."""
 _FROM_CLOUD = 4 * _CELL
 """Surfaces further from every point of the cloud are only where views contradict each other."""
 _LEAST_SHARE = 0.01
-"""Of all faces, that a piece of the mesh has."""
+"""Least share of all faces for a piece of the mesh to be kept."""
 
 
 def write_mesh(known: GlobalMap, world: WorldFrame, cloud: PointCloud, path: Path) -> int:

@@ -13,7 +13,7 @@ from extrap_train.reconstruction.global_map import GlobalMap
 from extrap_train.views import Camera, stack_cameras
 
 NEAREST_RAD, FARTHEST_RAD = np.radians(20), np.radians(40)
-"""Of a query, from the nearest known view."""
+"""Range of a query's angle from the nearest known view."""
 PREVIEW_SIZE = 32
 """Pixels of the warps that coverage is measured on."""
 SAME_COVERAGE = 0.1

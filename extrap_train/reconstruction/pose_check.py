@@ -14,7 +14,7 @@ from extrap_train.matching.sift import descriptor_distance, detect_sift, match_m
 from extrap_train.views import Camera, View
 
 Pixels = Float[np.ndarray, "_ 2"]
-"""Of as many matches as there are."""
+"""Pixels, one row per match."""
 SIDE = 640
 """Photographs are matched at this many pixels a side, at most."""
 LEAST_MATCHES = 30
@@ -22,7 +22,7 @@ FAR_PIXELS = 4.0
 """Median epipolar distance from which poses are suspect."""
 CLEARLY_BETTER = 0.4
 RATIO = 0.75
-"""Of Lowe's test."""
+"""Largest ratio of the nearest and second nearest distance in Lowe's test."""
 
 _FLIPS = {
     "OpenGL axes (+Y up, -Z forward)": (1.0, -1.0, -1.0),

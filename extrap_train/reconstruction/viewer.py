@@ -19,7 +19,7 @@ GENERATED_COLOUR = (235, 130, 30)
 POINT_SIZE = 0.004
 """In units of the cameras' distance from the scene."""
 FIRST_DISTANCE = 1.5
-"""Of a visitor, in the first camera's."""
+"""A visitor's first distance from the scene, in the first camera's distance."""
 FRUSTUM_SCALE = 0.08
 
 

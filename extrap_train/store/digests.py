@@ -24,7 +24,7 @@ def file_digest(path: Path) -> str:
     changed. Raises InputError if it cannot be read.
     """
     if path.exists() and not path.is_file():
-        raise InputError(f"{path}: is no file; give a file")  # a pipe would never end
+        raise InputError(f"{path}: is not a regular file; give one")  # a pipe would never end
     try:
         stamp = _stamp(path)
         if stamp[0] < _LARGE_BYTES:

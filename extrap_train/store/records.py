@@ -44,7 +44,7 @@ def read_record(path: Path, kind: type[T], remedy: str) -> T:
     """The record in a file that `write_record` wrote; entries that `kind` lacks are ignored.
 
     Raises InputError, which names the first entry that is missing or of the wrong type and ends
-    with `remedy`, where the file is no such record: unreadable, damaged, nested without end, or
+    with `remedy`, where the file is not such a record: unreadable, damaged, nested without end, or
     larger than `MAX_RECORD_BYTES`.
     """
     try:

@@ -101,7 +101,7 @@ def _model_folder(config: TrainConfig) -> Path:
     folder = given if is_own(given) else RunFolder(given).model
     if not is_own(folder):
         raise InputError(
-            f"weights={given}: is no model of this project; give a run's folder or its model/"
+            f"weights={given}: is not a model of this project; give a run's folder or its model/"
         )
     return folder
 

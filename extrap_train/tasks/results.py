@@ -84,7 +84,7 @@ def _require_finite(scores: pd.DataFrame, missing: Mapping[str, str]) -> None:
 
 
 def _undefined(means: dict[str, float], missing: dict[str, str]) -> dict[str, str]:
-    """Why a metric has no mean, where that is no fault."""
+    """Why a metric has no mean, where that is not a fault."""
     return {
         name: reason
         for name, reason in _WITHOUT_PIXELS.items()

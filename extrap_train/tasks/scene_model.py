@@ -165,8 +165,8 @@ def open_model(
         model = published_model(weights, config)
     else:
         raise InputError(
-            f"weights={weights}: is no model folder of this project; a published checkpoint needs "
-            "the configuration of its model as well"
+            f"weights={weights}: is not a model folder of this project; a published checkpoint "
+            "needs the configuration of its model as well"
         )
     if adapter is not None:
         load_adapter(model, Path(adapter))

@@ -13,7 +13,7 @@ from tests.benchmarks.tables import run_greys, write_own
 
 @contextmanager
 def _few_points() -> Iterator[None]:
-    """Of true surfaces, which take longer than everything else about a small capture."""
+    """Sample few points of true surfaces, the slowest part of preparing a small capture."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("benchmarks.protocol.captures.CLOUD_POINTS", 1000)
         yield

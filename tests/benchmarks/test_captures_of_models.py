@@ -43,7 +43,7 @@ def _models_of(weights: str | None) -> Trained:
 
 
 def _models(folder: Path, test: tuple[str, ...]) -> Trained:
-    """Of a method with the weights of a run that has held out these captures."""
+    """The models of a method whose weights come from a run that held out these captures."""
     train = tuple(name for name in _NAMES if name not in test)
     _write_run(folder, Split("co3d", train, test))
     return _models_of(str(folder / "{category}-run" / "model"))

@@ -1,4 +1,4 @@
-"""What is said of a change: only what enough captures bear out, and who judged."""
+"""What is said of a change: only what enough captures confirm, and who judged."""
 
 import json
 from dataclasses import replace

@@ -92,7 +92,7 @@ def test_nobody_is_behind_for_being_better() -> None:
 
 
 def test_who_is_left_is_not_the_best() -> None:
-    """Most methods lack a capture: the few that do not are no winners."""
+    """Most methods lack a capture: the few that do not are not winners."""
     names = ("a", "b", "c")
     table = results(
         *(cell(name, str(i), 0, 20.0 if i else None) for name in names for i in range(8)),

@@ -234,7 +234,7 @@ def test_a_dry_run_makes_nothing_and_says_what_is_missing(
 def test_a_dry_run_says_what_scoring_again_costs(
     own: Path, copy: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Of images that are there, by what scoring such cells has taken."""
+    """Estimated for images that are there, from the time that scoring such cells took."""
     for file in copy.glob("greys/cells/*/cell.json"):
         file.write_text(json.dumps(json.loads(file.read_text()) | {"scoring_seconds": 90.0}))
     capsys.readouterr()

@@ -78,7 +78,7 @@ def test_a_name_that_is_not_utf_8_costs_its_picture_alone(tmp_path, write):
     write(tmp_path, _entries(tmp_path))
     (file,) = tmp_path.glob("images.*")
     file.write_bytes(file.read_bytes().replace(b"20.png", b"2\xe9.png"))
-    _without_second(tmp_path, "is no plain text")
+    _without_second(tmp_path, "is not plain text")
 
 
 @pytest.mark.parametrize("write", [write_text, write_binary])

@@ -147,7 +147,7 @@ def binary(tmp_path, camera_number=7, model_number=PINHOLE, name=b"a.png", count
         ({"model_number": 99}, "has the number 99"),
         ({"name": b"../a.png"}, "climbs out of its folder"),
         ({"name": b"/a.png"}, "climbs out of its folder"),
-        ({"name": b"\xff"}, "is no plain text"),
+        ({"name": b"\xff"}, "is not plain text"),
         ({"name": b"b.png"}, "none of the 1 pictures"),
     ],
 )

@@ -114,7 +114,7 @@ def test_turned_photographs_are_read_upright(photographs, opened):
 
 @pytest.mark.usefixtures("opened", "no_mapping")
 def test_photographs_keep_their_cameras_when_masks_are_put_beside_them(photographs, tmp_path):
-    """Masks are no photographs, and upright as the pictures are shown."""
+    """Masks are not photographs, and upright as the pictures are shown."""
     folder = tmp_path / photographs[0].name
     shutil.copytree(photographs[0], folder)
     (folder / "masks").mkdir()

@@ -38,7 +38,7 @@ def _bytes(content: bytes) -> np.ndarray:
 @given(bits=arrays(np.uint16, (5, 5)))
 @settings(max_examples=200, deadline=None)
 def test_any_depth_comes_back_to_the_bit(bits: np.ndarray) -> None:
-    """Infinities and what is no number among them."""
+    """Infinities and what is not a number among them."""
     depth = bits.view(np.float16)
     assert np.array_equal(decode_depth(_bytes(encode_depth(depth)), 5).view(np.uint16), bits)
 
@@ -69,7 +69,7 @@ def test_other_bytes_are_an_error(decode, name: str) -> None:
 
 @pytest.mark.parametrize("category", ["apple", "hydrant"])
 def test_frames_of_real_captures_stay_small(shared, category: str) -> None:
-    """Of 512 pixels: at most 140 kB, and 40 dB from the photograph they were made from."""
+    """A frame of 512 pixels has at most 140 kB, and 40 dB against its photograph."""
     frame = read_category(shared / "data" / "co3d", category)[0].frames[0]
     image = to_eight_bits(object_square(frame.load(depth=False), 512).image).transpose(1, 2, 0)
     content = encode_image(np.ascontiguousarray(image))

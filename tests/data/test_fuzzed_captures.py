@@ -29,7 +29,7 @@ from extrap_train.errors import InputError
 pytestmark = pytest.mark.slow
 
 CASES = 130
-"""Of every kind; there are seven."""
+"""Cases of each of the seven kinds."""
 SECONDS, BYTES = 20, 4 * 2**30
 RUNS_SOMETHING = ("subprocess.", "os.system", "os.exec", "os.posix_spawn", "os.fork", "pickle.")
 

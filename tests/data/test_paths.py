@@ -75,5 +75,5 @@ def test_what_is_no_file_is_one_line_and_is_not_waited_for(no_file):
 
 def test_a_pipe_is_no_transforms_json(tmp_path):
     os.mkfifo(tmp_path / "transforms.json")
-    with pytest.raises(InputError, match="is no regular file"):
+    with pytest.raises(InputError, match="is not a regular file"):
         read_transforms(tmp_path)

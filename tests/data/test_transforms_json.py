@@ -203,7 +203,7 @@ def test_depth_may_be_an_array(folder):
     np.save(folder / "depth.npy", view_at(0).depth.numpy())
     torch.testing.assert_close(read_transforms(folder).frames[0].load().depth, view_at(0).depth)
     np.save(folder / "depth.npy", np.array([{}], dtype=object))
-    assert "depth.npy: is no array of numbers" in complaint_of(_load_first, folder)
+    assert "depth.npy: is not an array of numbers" in complaint_of(_load_first, folder)
     np.save(folder / "depth.npy", np.ones((3, 3)))
     assert "depth.npy: is an array of float64 (3, 3)" in complaint_of(_load_first, folder)
 

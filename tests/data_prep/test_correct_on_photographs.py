@@ -57,7 +57,7 @@ def apple(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> PreparedDat
 def corrections(
     data: PreparedData, truth: Callable[[Picture], Picture] = lambda image: image, every: int = 1
 ) -> list[Correction]:
-    """Of every so-manieth training pair, with what `truth` makes of the query's photograph."""
+    """Corrections of each `every`-th training pair, whose query photograph `truth` has changed."""
     method, found = matcher(FlowMatcherConfig()), []
     for pair in list(data.pairs("train"))[::every]:
         (reference,), query = pair.references, pair.query

@@ -92,7 +92,7 @@ def captures(tmp_path_factory: pytest.TempPathFactory) -> Captures:
 
 
 def configuration(seed: int) -> TrainConfig:
-    """Of the packaged base, trained on for a little while: the average must forget soon."""
+    """Continues the packaged base for a few steps, so its moving average must forget soon."""
     options = ["category=hydrant", f"seed={seed}", f"trainer.steps={STEPS}"]
     options += ["trainer.warmup_steps=20", "trainer.ema_decay=0.97", "trainer.workers=0"]
     options += [f"trainer.checkpoint_every={STEPS}", f"validation.examples={VIEWS}"]

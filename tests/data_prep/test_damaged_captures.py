@@ -94,7 +94,7 @@ def test_damaged_sequences_are_reported_and_the_rest_goes_on(
     counts = data.sequences.set_index("sequence")[["frames", "frames_left_out"]]
     assert counts.loc["cup/one_corrupt"].tolist() == [FRAMES - 1, 1]
     assert counts.loc["cup/fine"].tolist() == [FRAMES, 0]
-    # One in twelve is no reason to give a sequence up.
+    # One in twelve is not a reason to give a sequence up.
     assert corrupt.name not in data.names("cup/one_corrupt")
     assert len(data.names("cup/one_corrupt")) == FRAMES - 1
     assert f"1 frames left out: {corrupt}" in caplog.text

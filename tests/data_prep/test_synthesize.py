@@ -104,7 +104,7 @@ def test_a_run_that_was_killed_before_its_first_sequence_goes_on(tmp_path, made)
 def test_a_download_is_left_as_it_is(tmp_path, names):
     write_capture(tmp_path, names, frames=1)
     before = contents(tmp_path)
-    with pytest.raises(InputError, match=r"cup: is no folder of synthetic captures.*data=co3d\?"):
+    with pytest.raises(InputError, match=r"cup: is not a folder of synthetic.*data=co3d\?"):
         synthesize(SMALL, "cup", tmp_path, LocalLauncher(1))
     assert contents(tmp_path) == before
 

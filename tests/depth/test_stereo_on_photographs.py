@@ -13,7 +13,7 @@ from extrap_train.depth.stereo import PlaneSweepStereo, forward_backward_error
 from extrap_train.views import Camera, View
 
 FOCAL, BASELINE, OFFSET = 994.978, 193.001, 31.086
-"""Of the motorcycle pair: pixels, millimetres, and pixels between the two principal points."""
+"""The motorcycle pair's calibration: pixels, millimetres, pixels between the principal points."""
 
 
 def motorcycle() -> tuple[View, View, Float[Tensor, "h w"]]:

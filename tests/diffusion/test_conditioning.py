@@ -79,7 +79,7 @@ def test_zeroed_examples_are_null_and_the_others_untouched() -> None:
     assert not some.latents[0].any()
     assert not some.embedding[0].any()
     assert torch.equal(some.latents[1], one.latents[1])
-    assert torch.equal(some.base, one.base), "the base is added afterwards and is no condition"
+    assert torch.equal(some.base, one.base), "the base is added afterwards and is not a condition"
     doubled = one.doubled()
     assert torch.equal(doubled.latents[2:], one.zeroed(torch.tensor([True, True])).latents)
 

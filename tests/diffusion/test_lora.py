@@ -95,11 +95,11 @@ def test_other_weights_and_other_folders_are_refused(config: ModelConfig, tmp_pa
     nn.init.normal_(unlike.cc_projection.weight, std=0.1)  # what the adapted layers attend to
     with pytest.raises(InputError, match="was trained on other weights"):
         load_adapter(unlike, tmp_path / "adapter")
-    with pytest.raises(InputError, match="is no adapter folder of task=scene"):
+    with pytest.raises(InputError, match="is not an adapter folder of task=scene"):
         load_adapter(random_model(config), tmp_path / "gone")
     weights = tmp_path / "adapter" / "adapter_model.safetensors"
     weights.write_bytes(weights.read_bytes()[:100])
-    with pytest.raises(InputError, match="is no adapter folder of task=scene"):
+    with pytest.raises(InputError, match="is not an adapter folder of task=scene"):
         load_adapter(random_model(config), tmp_path / "adapter")
 
 

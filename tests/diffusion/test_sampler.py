@@ -124,7 +124,7 @@ class GaussianDenoiser(nn.Module):
         return gain * noisy / self.spread_at(alpha) ** 2
 
     def scale_error(self, batch: PairBatch, options: SamplerConfig) -> float:
-        """Of the picture's scale, which is all that the flow changes."""
+        """Error of the picture's scale, which is all that the flow changes."""
         names = "abc"
         drawn = [torch.randn(12, 16, 16, generator=view_generator(0, name)) for name in names]
         timesteps = sampling_timesteps(self.schedule, options)

@@ -69,7 +69,7 @@ def reached(inputs: list[View], targets: list[View]) -> Float[Tensor, "n h w"]:
 
 
 def all_around(category: str) -> Task:
-    """Of the farthest-point nine of 24 the first three (about 120° apart); the other six."""
+    """Nine farthest points of 24: the first three (about 120° apart) are inputs, others targets."""
     views = capture(category, frames=24, size=48)
     centers = camera_centers(stack_poses([view.camera for view in views]))
     nine = farthest_point_sample(centers, 9).tolist()

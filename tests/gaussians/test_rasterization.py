@@ -116,7 +116,7 @@ def test_not_a_number_is_not_drawn():
     worse.opacities[32], worse.means[33, 2] = torch.nan, torch.inf
     inputs = leaves(worse, camera_pose(), torch.float32)
     image = draw(inputs, degree=0)[0]
-    # Of more Gaussians: vectorised kernels may round a tensor's end otherwise than its middle.
+    # With more Gaussians: vectorised kernels may round a tensor's end otherwise than its middle.
     torch.testing.assert_close(image, whole, atol=1e-5, rtol=0)
     image.sum().backward()
     assert all(x.grad.isfinite().all() for x in inputs)

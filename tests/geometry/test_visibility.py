@@ -50,7 +50,7 @@ def center_of(image):
 NOTHING = torch.zeros(64, 64)
 SPHERE = scenes.Scene((scenes.sphere(0.8), scenes.plane(5.0)))
 SHADOW_RADIUS = DISTANCE * math.tan(math.asin(0.8 / DISTANCE))
-"""Of the sphere's shadow where the ray across it passes the centre."""
+"""Radius of the sphere's shadow where the ray across it passes the centre."""
 
 
 def test_behind_a_sphere_all_is_unobserved_up_to_its_front():

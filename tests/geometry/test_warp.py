@@ -33,8 +33,8 @@ def same(a: Warp, b: Warp, tolerance=1e-4):
 
 
 def seen_from(scene, angle_deg) -> tuple[float, float, float]:
-    """Of one reference's warp: the share of what both cameras see that is covered, the share of
-    valid pixels that show another surface, and their mean colour error."""
+    """Measures of one reference's warp: the share of what both cameras see that is covered, the
+    share of valid pixels that show another surface, and their mean colour error."""
     images, depths, cameras = references(scene, [0])
     query = scenes.orbit_camera(angle_deg, size=256)
     result = warp(images, depths, cameras, query)

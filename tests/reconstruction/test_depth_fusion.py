@@ -25,7 +25,7 @@ def _map(*errors: float) -> GlobalMap:
 
 
 def _errors(views: tuple[MapView, ...]) -> Tensor:
-    """Of the known depths of all the views."""
+    """Errors of the known depths of all the views."""
     errors = [(v.depth / SCENE.depth(v.camera) - 1).abs()[v.depth > 0] for v in views]
     return torch.cat(errors)
 

@@ -22,7 +22,7 @@ def viewer() -> Iterator[CloudViewer]:
 
 
 def _status(viewer: CloudViewer, *headers: str) -> int:
-    """Of the answer to a websocket's opening handshake with these headers."""
+    """Status of the answer to a websocket's opening handshake with these headers."""
     lines = [
         "GET / HTTP/1.1",
         *headers,

@@ -27,7 +27,7 @@ from extrap_train.tasks.training_data import require_unseen
 def _split(
     test: int, seed: int | None = 0, of: str = "hydrant", source: str = "synthetic"
 ) -> Manifest:
-    """Of a run whose first `test` captures are held out."""
+    """Manifest of a run whose first `test` captures are held out."""
     names = tuple(f"{index:04d}" for index in range(12))
     return Manifest.of({}, {}, {of: Split(source, names[test:], names[:test], seed)})
 

@@ -185,7 +185,7 @@ def _viewpoint(viewpoint: dict[str, Any]) -> tuple[float, ...]:
 
 
 def _number(value: Any) -> float:
-    """Truth values are no numbers: NaN, so that the entry is found degenerate."""
+    """Truth values are not numbers: NaN, so that the entry is found degenerate."""
     return math.nan if isinstance(value, bool) else float(value)
 
 

@@ -25,7 +25,7 @@ from extrap_train.views import Camera, View
 
 JPEG_QUALITY = 95
 EXACT_QUALITY = 1.0
-"""CO3D's quality scores rate an estimate; ours are no estimates."""
+"""CO3D's quality scores rate an estimate; ours are not estimates."""
 
 
 def write_frame(

@@ -13,7 +13,7 @@ Color = Float[np.ndarray, " 3"]
 Numbers = Float[np.ndarray, " n"]
 """One a point."""
 _RINGS = 9.0
-"""Of wood, per unit length."""
+"""Growth rings of wood per unit length."""
 _BAND = 0.4
 """Share of a plaid's period that a band takes."""
 

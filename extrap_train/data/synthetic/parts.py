@@ -62,7 +62,7 @@ class SyntheticScene:
     look_at: Float[np.ndarray, " 3"]
     """Centre of the object."""
     radius: float
-    """Of the smallest ball around `look_at` that holds the object."""
+    """Radius of the smallest ball around `look_at` that holds the object."""
 
     @cached_property
     def mesh(self) -> Mesh:

@@ -15,7 +15,7 @@ from extrap_train.data.synthetic.vectors import dot, normalize, rotate
 from extrap_train.views import Camera, View
 
 _REACH = 1.5
-"""Of the points, in object heights from the origin."""
+"""Farthest points, in object heights from the origin."""
 _PIXEL_ANGLE = 0.004
 """Radians: textures are sampled as finely as a photograph shows them."""
 _SHADOW_OFFSET = np.float32(0.004)

@@ -6,7 +6,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 ROTARY_BASE = 100.0
-"""Of the geometric series of wavelengths (`RoPE100`)."""
+"""Base of the geometric series of wavelengths (`RoPE100`)."""
 NORM_EPS = 1e-6
 MLP_RATIO = 4
 

@@ -13,9 +13,9 @@ from extrap_train.depth.mast3r.point_map_network import Architecture, PointMapNe
 from extrap_train.weight_files import WeightFile
 
 HEAD_WIDTH = 64
-"""Of every published network, where the file does not say it."""
+"""Width of an attention head in every published network; the file does not always say it."""
 MAX_BLOCKS = 100
-"""Of an encoder or decoder; the published ones have at most 24."""
+"""Most blocks of an encoder or decoder; the published ones have at most 24."""
 
 
 def read_network(path: Path, option: str = "depth.checkpoint") -> PointMapNetwork:

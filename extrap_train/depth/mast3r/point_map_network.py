@@ -31,7 +31,7 @@ class Architecture:
     patch: int = 16
     head: Head = "dense"
     descriptor_width: int | None = 24
-    """Of MASt3R's descriptors, which are part of the weights, without use here; None for DUSt3R,
+    """Width of MASt3R's descriptors, which are in the weights but not used here; None for DUSt3R,
     which has none.
     """
 
@@ -68,7 +68,7 @@ class PointMapNetwork(nn.Module):
         a = self.architecture = architecture
         self.patch_embed = _PatchEmbedding(a.encoder_width, a.patch)
         self.mask_token = nn.Parameter(torch.zeros(1, 1, a.decoder_width))
-        """Of the pre-training; part of the weights, without use here."""
+        """Token used in pre-training: it is in the weights but not used here."""
         self.enc_blocks = nn.ModuleList(
             EncoderBlock(a.encoder_width, a.encoder_heads) for _ in range(a.encoder_depth)
         )

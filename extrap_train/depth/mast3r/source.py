@@ -54,7 +54,7 @@ class _Prepared:
     view: View
     fit: Fit
     camera: Camera
-    """Of what the network sees."""
+    """Camera of the picture that the network sees."""
     encoding: Encoding
 
     def undone(self, depth_map: DepthMap) -> DepthMap:

@@ -91,7 +91,7 @@ def compute_warp(batch: PairBatch, image_size: int | None = None) -> PairBatch:
     )
     factor, rest = divmod(batch.camera.height, image_size or batch.camera.height)
     if rest or not factor:
-        raise ValueError(f"{batch.camera.height} pixels are no multiple of {image_size}")
+        raise ValueError(f"{batch.camera.height} pixels are not a multiple of {image_size}")
     return reduce_batch(replace(batch, warp=warp), factor)
 
 

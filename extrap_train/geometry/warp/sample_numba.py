@@ -150,7 +150,7 @@ def _may_be_seen(m, inverse, slopes, y, x, size):
 
 @compiled()
 def _greatest(m, inverse, slopes, y, x, a, b, c):
-    """Of `a·X + b·Y + c·ratio` over a pixel, (X, Y) / ratio being its place in the query."""
+    """Maximum of `a·X + b·Y + c·ratio` over a pixel; (X, Y) / ratio is its place in the query."""
     along_u = a * m[0, 0] + b * m[1, 0] + c * m[2, 0]
     along_v = a * m[0, 1] + b * m[1, 1] + c * m[2, 1]
     constant = a * m[0, 2] + b * m[1, 2] + c * m[2, 2]

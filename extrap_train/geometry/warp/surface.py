@@ -20,9 +20,9 @@ ALWAYS_SURFACE = 3.0
 """Tangent of the angle between viewing ray and normal up to which two neighbours always form a
 surface (72°)."""
 DEPTH_NOISE = 0.02
-"""Steps up to this share of the depth are no edges either: sensors and estimates are no better."""
+"""Steps up to this share of the depth are not edges: sensors and estimates are as noisy."""
 NEVER_SURFACE = 30.0
-"""... and beyond which they never do (88°)."""
+"""Tangent beyond which they never do (88°)."""
 LARGEST_BEND = 0.7
 """In between: largest change of slope from pixel to pixel that a surface may have, as a share of
 the slope."""

@@ -34,7 +34,7 @@ def saved(references: dict[str, Reference], tmp_path_factory: pytest.TempPathFac
 
 @pytest.fixture
 def config(saved: Path, tmp_path: Path) -> ModelConfig:
-    """Of a copy whose files may be changed."""
+    """The configuration of a copy whose files may be changed."""
     shutil.copytree(saved, tmp_path / "model")
     return tiny_config("zeronvs", start=str(tmp_path / "model"))
 
