@@ -17,7 +17,9 @@ from extrap_train.views import Camera, View
 WINDOW = 5
 """Side of the window that is compared, in pixels."""
 CHUNK_ELEMENTS = 4_000_000
-"""Most colour samples that are held at a time."""
+"""Most colour samples that torch holds at a time."""
+CHUNK_COSTS = 64_000_000
+"""Most costs that the compiled kernel holds at a time."""
 
 
 @dataclass(frozen=True)
@@ -81,8 +83,10 @@ class PhotoCost:
 
     def __call__(self, inverse_depth: Float[Tensor, "d h w"]) -> Float[Tensor, "d h w"]:
         """Cost in [0, 1] per hypothesis; 0.5, which says nothing, where no neighbour sees it."""
-        size = max(1, CHUNK_ELEMENTS // (self.image.numel() * len(self.neighbours)))
-        cost = self.cost_torch if needs_torch(inverse_depth, self.image) else self._cost_numba
+        in_torch = needs_torch(inverse_depth, self.image)
+        cost = self.cost_torch if in_torch else self._cost_numba
+        most = CHUNK_ELEMENTS // len(self.image) if in_torch else CHUNK_COSTS
+        size = max(1, most // (self.image[0].numel() * len(self.neighbours)))
         return torch.cat([cost(chunk) for chunk in inverse_depth.split(size)])
 
     def _cost_numba(self, inverse_depth: Float[Tensor, "d h w"]) -> Float[Tensor, "d h w"]:

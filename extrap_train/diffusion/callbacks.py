@@ -56,8 +56,8 @@ class MetricsTable(Logger):
     @rank_zero_only
     def save(self) -> None:
         """Write the table whole; Lightning asks every process, and the first one has the rows."""
-        table = pd.DataFrame(self._rows).to_csv(index=False, float_format="%.6g")
-        write_atomic(self.path, table.encode())
+        table = pd.DataFrame(self._rows or {"step": []})
+        write_atomic(self.path, table.to_csv(index=False, float_format="%.6g").encode())
 
 
 def _read(path: Path) -> list[dict[Any, Any]]:
@@ -67,7 +67,7 @@ def _read(path: Path) -> list[dict[Any, Any]]:
         table = pd.read_csv(path, dtype={"step": int}, index_col=False)
         steps = table.pop("step")
         rows = table.astype(float).to_dict("records")
-    except (ValueError, KeyError) as error:
+    except (ValueError, KeyError, OverflowError) as error:
         reason = " ".join(str(error).split())
         raise InputError(
             f"{path}: damaged ({reason}); delete it to go on without the rows of earlier steps"

@@ -24,7 +24,7 @@ from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.diffusion.packaged import packaged_name
 from extrap_train.errors import InputError
 from extrap_train.reconstruction.depth_prediction.calibration import DepthScores, calibrate
-from extrap_train.reconstruction.depth_prediction.examples import draw_examples
+from extrap_train.reconstruction.depth_prediction.examples import LEAST_FRAMES, draw_examples
 from extrap_train.reconstruction.depth_prediction.network import save_depth_network
 from extrap_train.reconstruction.depth_prediction.network_training import (
     DepthTraining,
@@ -53,6 +53,10 @@ def run(config: TrainConfig) -> Outcome:
         raise InputError(
             f"data={data.name}: task=depth needs captures whose depth is known everywhere; use "
             "data=synthetic"
+        )
+    if data.frames < LEAST_FRAMES:
+        raise InputError(
+            f"data.frames={data.frames}: task=depth needs at least {LEAST_FRAMES} a capture"
         )
     folder = Path(config.output) / "depth" / (given_name(config) or config.category.name)
     with claim(folder, _manifest(config), resume=config.resume) as claimed:

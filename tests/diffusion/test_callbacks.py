@@ -50,6 +50,15 @@ def test_a_resumed_table_drops_what_lies_behind_the_checkpoint(tmp_path: Path) -
     assert path.read_text().split() == ["step,loss", "20,20", "40,40", "60,7"]
 
 
+def test_a_run_that_ended_before_its_first_row_goes_on(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.csv"
+    MetricsTable(path, 0).save()
+    resumed = MetricsTable(path, 10)
+    resumed.log_metrics({"loss": 1.0}, 20)
+    resumed.save()
+    assert path.read_text().split() == ["step,loss", "20,1"]
+
+
 @pytest.mark.parametrize(
     "content",
     [
@@ -59,6 +68,7 @@ def test_a_resumed_table_drops_what_lies_behind_the_checkpoint(tmp_path: Path) -
         "step,loss\n\x00,1",
         "step\n1.5",
         "step,loss\n20,1,2\n,3",
+        "step,loss\n99999999999999999999,1",
     ],
 )
 def test_a_damaged_table_is_one_line(tmp_path: Path, content: str) -> None:

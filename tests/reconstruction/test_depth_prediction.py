@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import scenes
 import torch
+from in_process import run_command
 
+from extrap_train.__main__ import main
 from extrap_train.config import CompletionConfig, TrainerConfig
 from extrap_train.data.sequences import Frame
 from extrap_train.depth.dataset import DatasetDepth
@@ -15,6 +17,7 @@ from extrap_train.geometry.visibility import Ball
 from extrap_train.reconstruction.completion import CompletionPipeline, add_view, map_of_inputs
 from extrap_train.reconstruction.depth_prediction.calibration import calibrate
 from extrap_train.reconstruction.depth_prediction.examples import (
+    LEAST_FRAMES,
     DepthExamples,
     draw_examples,
     with_truth,
@@ -299,3 +302,10 @@ def test_examples_are_what_completion_observes_with_the_true_depth(drawn):
     off = (drawn.seen.warp_log_depth - drawn.log_depth).abs()
     assert certain.float().mean() > 0.1
     assert (off[certain] < 0.05).float().mean() > 0.9
+
+
+def test_captures_of_too_few_photographs_are_refused(tmp_path):
+    few = f"data.frames={LEAST_FRAMES - 1}"
+    said = run_command(main, "task=depth", "category=cup", few, f"output={tmp_path}", status=1)
+    assert said.startswith(f"error: {few}")
+    assert not [*tmp_path.iterdir()]

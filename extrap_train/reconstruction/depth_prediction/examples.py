@@ -28,6 +28,8 @@ from extrap_train.views import Camera, View, combine, stack_poses
 Truth = Callable[[Camera], tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]]
 """A capture's depth and object mask from any camera, in its own world and unit."""
 
+LEAST_FRAMES = 12
+"""Frames that a capture needs, so that neighbouring photographs stand at most 30° apart."""
 MOST_INPUTS = 6
 STEP_DEG = (22.0, 40.0)
 """Between neighbouring views of the orbit."""
@@ -60,7 +62,7 @@ def draw_examples(
     measured. Generated views enter the map with the true depth, spoiled smoothly. Each is observed
     twice: when it is generated, and from its nearest neighbours once all views are there.
     """
-    count = int(rng.integers(3, min(MOST_INPUTS, len(frames)) + 1))
+    count = int(rng.integers(3, MOST_INPUTS + 1))
     chosen = [
         frames[i] for i in choose_frames(frames, count, (), "one_sided", int(rng.integers(99)))
     ]
