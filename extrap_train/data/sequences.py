@@ -57,6 +57,7 @@ class Photograph:
     """Camera of the undistorted photograph."""
     image_path: str
     mask: Path | None = None
+    """As it is opened, the root included."""
     depth: DepthFile | None = None
     lens: Lens | None = None
     """To be undone; None for a pinhole camera's photograph."""
@@ -69,14 +70,14 @@ class Photograph:
         parts.append(f"depth in {self.depth.scale if self.depth else None}")
         parts += ["upright"] if self.upright else []
         depth = (self.depth.path, self.depth.mask_path) if self.depth else ()
-        files = self.image_path, self.mask, *depth
+        files = [self.root / self.image_path, *([self.mask] if self.mask else ())]
         return Frame(
             name=self.name,
             camera=self.camera,
             has_depth=self.depth is not None,
             has_mask=self.mask is not None,
             load=self.load,
-            files=tuple(self.root / file for file in files if file),
+            files=(*files, *(self.root / file for file in depth if file)),
             reading=", ".join(parts),
         )
 
