@@ -6,13 +6,12 @@ way its camera holds it.
 
 import functools
 import io
-import itertools
 import logging
 import math
 import operator
 import struct
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -104,12 +103,8 @@ def read_mask(path: Path, size: tuple[int, int]) -> Float[Tensor, "h w"]:
             f"{path}: the mask selects nothing (black is background); correct or remove it, or "
             "remove its frame"
         )
-    if pixels.min() == pixels.max() and next(_full_masks(path.parent)) == 0:
-        log.warning(
-            "%s: the mask selects the whole picture, and so may others of its folder; correct or "
-            "remove them",
-            path,
-        )
+    if pixels.min() == pixels.max():
+        _warn_of_full_masks(path.parent)
     return torch.from_numpy(pixels).float().div_(1 if pixels.max() == 1 else 255)
 
 
@@ -315,9 +310,11 @@ def _on_ground(picture: Image.Image, grey: int) -> Image.Image:
 
 
 @functools.lru_cache(maxsize=1024)
-def _full_masks(folder: Path) -> Iterator[int]:
-    """Counts the masks of a folder that select everything."""
-    return itertools.count()
+def _warn_of_full_masks(folder: Path) -> None:
+    log.warning(
+        "%s: holds masks that select the whole picture; correct or remove them",
+        folder,
+    )
 
 
 @functools.lru_cache(maxsize=1024)

@@ -1,4 +1,4 @@
-"""Training a scene's adapter within a time budget, ended early by what is held out."""
+"""Training a scene's adapter within a time budget, stopped early by held-out pairs."""
 
 import math
 import time
@@ -25,11 +25,11 @@ from extrap_train.geometry.warp import compute_warp
 from extrap_train.views import PairBatch, combine
 
 _LEVELS = 4
-"""Of noise, at most, at which what is held out is measured; a long schedule is taken in strides."""
+"""Most noise levels at which held-out pairs are measured; a long schedule is taken in strides."""
 _DRAWS = 8
-"""Of noise at every level, shared among the held-out pairs."""
+"""Draws of noise at every level, shared among the held-out pairs."""
 _MEASURING_SHARE = 0.1
-"""Of the time budget, at most, for measuring once what is held out."""
+"""Largest share of the time budget for measuring the held-out pairs once."""
 _WARMUP = 20
 """Steps until the full learning rate."""
 _AVERAGE_DECAY = 0.98
@@ -41,8 +41,8 @@ _CONDITION_DROPOUT = 0.05
 class Adaptation:
     """How an adapter was trained."""
 
-    losses: list[tuple[int, float]]
-    """(step, error on what is held out); the first is the model's without the adapter."""
+    held_out_errors: list[tuple[int, float]]
+    """(step, error on the held-out pairs); the first is the model's without the adapter."""
     best_step: int
     """The step whose weights were kept; 0 keeps the model as it was."""
     steps: int
@@ -66,17 +66,17 @@ def adapt(
 ) -> Adaptation:
     """Train the adapter and leave the model with its best weights.
 
-    With virtual references the truth is learnt where they reach, and in the holes the model is held
-    to what it generated before: few photographs say what surfaces look like here, but not what lies
-    in other directions. The inputs' own pairs are learnt whole, as in the paper.
+    With virtual references, pixels that the warp reaches are trained on the photograph; in holes
+    the model is trained to keep its original prediction: few photographs show what surfaces look
+    like here, but not what lies in other directions. The inputs' own pairs are trained on whole
+    photographs, as in the paper.
 
     Candidates for the best weights are moving averages over the steps, because single steps are
     noisier than the progress between them; the base's own weights are the first candidate. The best
-    has the least error on the held-out pairs, measured with fixed noise
-    at levels that the sampler steps through: fewer of them where measuring all would take more than
-    a tenth of the budget. `on_step` hears of step 0, the base measured, and of every step, with the
-    share of the budget that is spent. Steps are a function of the seed; how many depends on the
-    clock.
+    has the least error on the held-out pairs, measured with fixed noise at levels that the sampler
+    steps through: fewer of them where measuring all would take more than a tenth of the budget.
+    `on_step` hears of step 0, the base measured, and of every step, with the share of the budget
+    that is spent. Steps are a function of the seed; how many depends on the clock.
     """
     started = clock()
 
@@ -91,8 +91,8 @@ def adapt(
     measure = _HeldOut(model, pairs.held_out_batch(), options.batch_size, sampler, fabric, anchored)
     measure.fit_into(_MEASURING_SHARE * seconds, clock)
     dropout = _CONDITION_DROPOUT if sampler.guidance != 1 else 0.0
-    losses = [(0, measure())]
-    if not math.isfinite(losses[0][1]):
+    errors = [(0, measure())]
+    if not math.isfinite(errors[0][1]):
         raise InputError(
             "the model's error on the scene's own views is not finite (NaN); either its weights "
             "are not: give other weights=, or trainer.precision is too low: give 32-true"
@@ -120,8 +120,8 @@ def adapt(
         if step % options.validate_every and step < options.steps and spent() < 1:
             continue
         peft.set_peft_model_state_dict(adapter, average)
-        losses.append((step, measure()))
-        if losses[-1][1] < min(loss for _, loss in losses[:-1]):
+        errors.append((step, measure()))
+        if errors[-1][1] < min(error for _, error in errors[:-1]):
             best, best_step = _weights(adapter), step
         peft.set_peft_model_state_dict(adapter, newest)
         if step - best_step >= options.patience * options.validate_every:
@@ -130,7 +130,7 @@ def adapt(
     if ended == "steps" and step < options.steps:
         ended = "time"
     peft.set_peft_model_state_dict(adapter, best)
-    return Adaptation(losses, best_step, step, clock() - started, ended)
+    return Adaptation(errors, best_step, step, clock() - started, ended)
 
 
 def _anchor(batch: PairBatch, unchanged: Unchanged | None) -> Anchor | None:
@@ -141,7 +141,7 @@ def _anchor(batch: PairBatch, unchanged: Unchanged | None) -> Anchor | None:
 
 
 _Part = tuple[Tensor, Conditioning, Anchor | None]
-"""Of the held-out pairs: targets, what the denoiser is told, and what their holes are held to."""
+"""Part of the held-out pairs: targets, conditioning, and what their holes are held to."""
 
 
 class _HeldOut:

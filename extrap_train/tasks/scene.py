@@ -244,8 +244,8 @@ def _write(
     measured: dict[str, dict[str, float]],
     missing: dict[str, str],
 ) -> None:
-    steps, losses = [list(column) for column in zip(*done.losses, strict=True)]
-    curve(steps, {"held-out pair": losses}, "denoising error", folder / "curve.png")
+    steps, errors = [list(column) for column in zip(*done.held_out_errors, strict=True)]
+    curve(steps, {"held-out pair": errors}, "denoising error", folder / "curve.png")
     summary = {
         "generated_with": asdict(used),
         "inputs": read[0],

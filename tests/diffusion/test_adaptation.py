@@ -56,10 +56,10 @@ def test_adapting_learns_the_scene_repeatably_and_keeps_the_best(config: ModelCo
     options = {"steps": 8, "learning_rate": 3e-3, "patience": 100, "virtual_references": 2}
     model, done = _adapt(config, **options)
     again, done_again = _adapt(config, **options)
-    assert done.losses == done_again.losses
+    assert done.held_out_errors == done_again.held_out_errors
     for one, other in zip(model.parameters(), again.parameters(), strict=True):
         assert torch.equal(one, other)
-    losses = dict(done.losses)
+    losses = dict(done.held_out_errors)
     assert done.best_step > 0
     assert losses[done.best_step] == min(losses.values()) < losses[0]
     assert done.ended == "steps"
@@ -74,7 +74,7 @@ def test_gradient_checkpointing_learns_the_same_with_less_memory(config: ModelCo
         if checkpointing:
             model.unet.enable_gradient_checkpointing()
         with LiveBytes(model.parameters()) as live:
-            losses.append(_adapted(model, replace(OPTIONS, steps=1, batch_size=8)).losses)
+            losses.append(_adapted(model, replace(OPTIONS, steps=1, batch_size=8)).held_out_errors)
         peaks.append(live.peak)
     assert losses[1] == losses[0]
     assert peaks[1] < 0.8 * peaks[0]
@@ -91,7 +91,7 @@ def test_it_ends_where_the_held_out_pair_gains_no_more_and_keeps_the_best_step(
     """Not the last: its weights are those of a training that ended where the best was."""
     options = {"learning_rate": 30.0, "patience": 2, "virtual_references": 2}
     model, done = _adapt(config, steps=400, **options)
-    losses = dict(done.losses)
+    losses = dict(done.held_out_errors)
     assert done.ended == "held-out pair"
     assert 0 < done.best_step == min(losses, key=losses.__getitem__)
     assert done.steps == done.best_step + 2 * OPTIONS.validate_every
@@ -125,8 +125,8 @@ def test_the_last_step_is_measured_and_can_be_kept(
 ) -> None:
     rate = {"learning_rate": 3e-3, "patience": 100, "virtual_references": 2}
     _, done = _adapt(config, steps=steps, validate_every=every, **rate)
-    assert done.losses[-1][0] == done.steps == steps
-    assert done.best_step == min(done.losses, key=lambda found: found[1])[0]
+    assert done.held_out_errors[-1][0] == done.steps == steps
+    assert done.best_step == min(done.held_out_errors, key=lambda found: found[1])[0]
     assert done.ended == "steps"
 
 
