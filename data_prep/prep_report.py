@@ -17,7 +17,7 @@ from data_prep.drop_summary import group_reasons
 from extrap_train.data.examples import linspace_indices, pack, read_example
 from extrap_train.data.prepared import UNTOUCHED, Pairs, PreparedData
 from extrap_train.data.square_frames import held_out_mask
-from extrap_train.figures import colour_depth, contact_sheet, error_map, mark_holes
+from extrap_train.figures import colour_depth, draw_contact_sheet, error_map, mark_holes
 from extrap_train.geometry.viewpoints import fit_orbit
 from extrap_train.geometry.warp import warp_references
 from extrap_train.store.atomic import write_atomic
@@ -43,7 +43,7 @@ def write_report(data: PreparedData, console: Console) -> Path:
     write_atomic(folder / "coverage.png", as_png(coverage(data)))
     by_angle = np.argsort(data.pairs("train").angle_rad, kind="stable")
     chosen = by_angle[linspace_indices(len(by_angle), SAMPLES)].tolist()
-    pair_sheet(data, chosen, folder / "pairs.png")
+    draw_pair_sheet(data, chosen, folder / "pairs.png")
     listed = list(dropped[["sequence", "reason"]].head(_LISTED).itertuples(index=False, name=None))
     page = folder / "report.html"
     source = files("data_prep").joinpath("templates/report.html").read_text("utf-8")
@@ -55,7 +55,7 @@ def write_report(data: PreparedData, console: Console) -> Path:
         reasons=reasons,
         dropped=listed,
         unlisted=len(dropped) - len(listed),
-        **correction_report(data, folder),
+        **report_correction(data, folder),
     )
     write_atomic(page, content.encode())
     console.print(f"report: {page}")
@@ -129,7 +129,7 @@ def coverage(data: PreparedData) -> Figure:
     return figure
 
 
-def correction_report(data: PreparedData, folder: Path) -> dict[str, Any]:
+def report_correction(data: PreparedData, folder: Path) -> dict[str, Any]:
     """What the page says of correction; draws its pictures into `folder`."""
     if not data.is_corrected:
         return {"corrections": {}, "worst": []}
@@ -137,7 +137,7 @@ def correction_report(data: PreparedData, folder: Path) -> dict[str, Any]:
     order = np.argsort(-np.nan_to_num(pairs.error_after, nan=-1.0), kind="stable")
     worst = [int(index) for index in order[:WORST]]
     write_atomic(folder / "correction.png", as_png(error_histogram(pairs)))
-    pair_sheet(data, worst, folder / "worst.png")
+    draw_pair_sheet(data, worst, folder / "worst.png")
     return {"corrections": correction_facts(data), "worst": [_row(data, pairs, i) for i in worst]}
 
 
@@ -179,7 +179,7 @@ def error_histogram(pairs: Pairs) -> Figure:
     return figure
 
 
-def pair_sheet(data: PreparedData, chosen: list[int], path: Path) -> None:
+def draw_pair_sheet(data: PreparedData, chosen: list[int], path: Path) -> None:
     """Training pairs, one per row: reference, depth, warp without and with flow, query, error.
 
     The caption of a row gives its number, angle, sequence, reference and query.
@@ -213,7 +213,7 @@ def pair_sheet(data: PreparedData, chosen: list[int], path: Path) -> None:
         f"{number}: {row['angle']}, {row['sequence']}, {row['reference']} → {row['query']}"
         for number, row in enumerate(rows, start=1)
     ]
-    contact_sheet(columns, path, captions)
+    draw_contact_sheet(columns, path, captions)
 
 
 def _row(data: PreparedData, pairs: Pairs, index: int) -> dict[str, Any]:

@@ -58,7 +58,7 @@ def error_map(
     return (2 * error).clamp(0, 1).expand(-1, 3, -1, -1)
 
 
-def contact_sheet(
+def draw_contact_sheet(
     columns: dict[str, Float[Tensor, "b 3 h w"]], path: Path, captions: Sequence[str] = ()
 ) -> None:
     """Write a PNG with one row for each example and one titled column for each kind of picture.
@@ -97,7 +97,7 @@ def _written_on(sheet: np.ndarray, texts: dict[tuple[int, int], str]) -> bytes:
     return png_bytes(np.asarray(picture))
 
 
-def curve(steps: list[int], series: dict[str, list[float]], label: str, path: Path) -> None:
+def plot_curve(steps: list[int], series: dict[str, list[float]], label: str, path: Path) -> None:
     """Plot lines over training steps, as PNG."""
     figure, axes = plt.subplots(figsize=(6, 4), layout="constrained")
     for name, values in series.items():
@@ -144,7 +144,7 @@ def picture_names(names: Sequence[str]) -> list[str]:
     return chosen
 
 
-def film(images: Float[Tensor, "n 3 h w"], path: Path) -> None:
+def write_film(images: Float[Tensor, "n 3 h w"], path: Path) -> None:
     """Write pictures as an animation, GIF or MP4 by the file's suffix, small ones enlarged.
 
     The MP4 holds VP9, which browsers and players read; a GIF repeats for ever.

@@ -7,14 +7,14 @@ import pytest
 import torch
 from PIL import Image
 
-from extrap_train.figures import contact_sheet
+from extrap_train.figures import draw_contact_sheet
 
 GREY = torch.tensor([0.2, 0.6])[:, None, None, None].expand(2, 3, 64, 64)
 """Two rows: 51 and 153 of 255."""
 
 
 def sheet(path: Path, *captions: str) -> np.ndarray:
-    contact_sheet({"left": GREY, "right": 1 - GREY}, path / "sheet.png", captions)
+    draw_contact_sheet({"left": GREY, "right": 1 - GREY}, path / "sheet.png", captions)
     return np.asarray(Image.open(path / "sheet.png"))
 
 

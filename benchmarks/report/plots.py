@@ -57,14 +57,14 @@ def _over_angle(part: pd.DataFrame, metric: str, results: Results) -> str:
         for index, (method, entry) in enumerate(results.methods.items()):
             own = binned(chosen[chosen["method"] == method])
             aside = (index - (len(results.methods) - 1) / 2) * _ASIDE_DEG
-            _curve(axes, own, aside, f"C{index}", one_line(entry.title or method))
-        _captures_below(axes, chosen)
+            _draw_curve(axes, own, aside, f"C{index}", one_line(entry.title or method))
+        _draw_capture_counts(axes, chosen)
         axes.set_title(f"{one_line(draw)} inputs, {n_views} views", fontsize="medium")
     for axes in grid[-1]:
         axes.set_xlabel("angle to the nearest input, degrees")
     for axes in grid[:, 0]:
         axes.set_ylabel(name_of(metric))
-    _legend(figure)
+    _draw_legend(figure)
     return _svg(figure)
 
 
@@ -78,7 +78,7 @@ def binned(images: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame({"mean": groups.mean(), "error": groups.sem(), "captures": groups.count()})
 
 
-def _curve(axes: Axes, own: pd.DataFrame, aside: float, color: str, label: str) -> None:
+def _draw_curve(axes: Axes, own: pd.DataFrame, aside: float, color: str, label: str) -> None:
     """Hollow where a single capture is all there is."""
     if own.empty:
         return
@@ -88,7 +88,7 @@ def _curve(axes: Axes, own: pd.DataFrame, aside: float, color: str, label: str) 
     axes.plot(at[single], own["mean"][single], "o", ms=4, mec=color, mfc="white", zorder=3)
 
 
-def _captures_below(axes: Axes, images: pd.DataFrame) -> None:
+def _draw_capture_counts(axes: Axes, images: pd.DataFrame) -> None:
     """How many captures have a target at such angles, along the lower edge."""
     captures = binned(images)["captures"]
     for center, count in zip(captures.index.to_numpy(), captures, strict=True):
@@ -116,11 +116,11 @@ def _over_time(means: pd.DataFrame, metric: str, results: Results) -> str:
     axes.set_xscale("log")
     axes.set_xlabel("perform time, seconds (in all, or per image: see the notes)")
     axes.set_ylabel(name_of(metric))
-    _legend(figure)
+    _draw_legend(figure)
     return _svg(figure)
 
 
-def _legend(figure: Figure) -> None:
+def _draw_legend(figure: Figure) -> None:
     """Beside the panels, where it hides no point; with what any of them shows."""
     found: dict[str, Any] = {}
     for axes in figure.axes:

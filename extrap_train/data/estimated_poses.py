@@ -73,7 +73,7 @@ def read_unposed(folder: Path, pictures: Sequence[str], name: str) -> FrameSeque
             f"{folder}: has {len(pictures)} photographs without cameras, and those of at most "
             f"{MOST_PICTURES} are estimated; choose some, or run COLMAP yourself"
         )
-    pictures = _present(folder, pictures)
+    pictures = _select_present(folder, pictures)
     settings = {"max_side": MAX_SIDE, "max_features": MAX_FEATURES, "seed": SEED}
     content = json.dumps([settings, {p: file_digest(folder / p) for p in sorted(pictures)}])
     key = hashlib.sha256(content.encode()).hexdigest()[:16]
@@ -108,7 +108,7 @@ def read_unposed(folder: Path, pictures: Sequence[str], name: str) -> FrameSeque
     return replace(sequence, left_out=reasons, listed=tuple(pictures))
 
 
-def _present(folder: Path, pictures: Sequence[str]) -> list[str]:
+def _select_present(folder: Path, pictures: Sequence[str]) -> list[str]:
     """Those that are files, or links to files, with names that can be written down."""
     present = []
     for name in pictures:

@@ -43,7 +43,7 @@ def _draw_row(axes: list[Axes], check: CaptureCheck, matched: MatchedViews, whic
     """Features of a view; their epipolar lines and matches in the nearest; points in the third."""
     views = [check.views[index] for index in matched.views]
     for axis, view in zip(axes, views, strict=True):
-        _show(axis, view)
+        _show_photograph(axis, view)
     shown = np.linspace(0, len(matched.pixels) - 1, min(LINES, len(matched.pixels))).astype(int)
     # From left to right, so that colours of neighbours are alike.
     shown = shown[np.argsort(matched.pixels[shown, 0])]
@@ -84,7 +84,7 @@ def _shortened(text: str) -> str:
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}…"
 
 
-def _show(axis: Axes, view: View) -> None:
+def _show_photograph(axis: Axes, view: View) -> None:
     """The photograph, darker outside of its mask."""
     image = view.image.permute(1, 2, 0).numpy()
     if view.mask is not None:
@@ -117,7 +117,7 @@ def _draw_cameras(plan: Axes, side: Axes, check: CaptureCheck) -> None:
         axis.scatter(*_uv(points @ plane), s=2, c="0.6")
         (x, y), (u, v) = (centers @ plane).T, length * (forward @ plane).T
         axis.quiver(x, y, u, v, color="C0", angles="xy", scale_units="xy", scale=1, width=0.006)
-        _number(axis, x, y)
+        _number_cameras(axis, x, y)
         axis.plot(0, 0, "k+")
         axis.set_xlim(-reach, reach)
         axis.set_ylim(-reach, reach)
@@ -129,7 +129,7 @@ def _uv(places: Float[np.ndarray, "n 2"]) -> tuple[np.ndarray, np.ndarray]:
     return places[:, 0], places[:, 1]
 
 
-def _number(axis: Axes, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> None:
+def _number_cameras(axis: Axes, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> None:
     for number, place in enumerate(zip(x, y, strict=True)):
         axis.annotate(str(number + 1), place, color="C3", fontsize=8)
 

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrap_train.figures import contact_sheet, film, save_figure
+from extrap_train.figures import draw_contact_sheet, save_figure, write_film
 from extrap_train.geometry.orbits import fit_circle
 from extrap_train.geometry.viewpoints import camera_centers, scene_center
 from extrap_train.geometry.warp import splat_points
@@ -43,13 +43,13 @@ def draw_growth(known: GlobalMap, cloud: PointCloud, path: Path) -> None:
         title = f"{given} inputs" if count == given else f"+ {count - given} views"
         then = cloud[cloud.view < count]
         columns[title] = torch.cat([_drawn(_near(then, close), close), _drawn(then, far)])
-    contact_sheet(columns, path)
+    draw_contact_sheet(columns, path)
 
 
 def draw_turntable(known: GlobalMap, cloud: PointCloud, path: Path) -> None:
     """A film around the whole cloud."""
     cameras = _turn(known, TURN_FRAMES)
-    film(_drawn(_near(cloud, cameras), cameras), path)
+    write_film(_drawn(_near(cloud, cameras), cameras), path)
 
 
 def framed(cameras: Camera, cloud: PointCloud) -> Camera:

@@ -54,8 +54,8 @@ class CloudViewer:
         self._step = gui.add_slider("views", min=1, max=2, step=1, initial_value=1)
         self._least = gui.add_slider("least confidence", 0.0, 1.0, 0.05, 0.1)
         self._count = gui.add_text("points", "0", disabled=True)
-        self._step.on_update(self._moved)
-        self._least.on_update(self._moved)
+        self._step.on_update(self._on_slider_moved)
+        self._least.on_update(self._on_slider_moved)
 
     @property
     def port(self) -> int:
@@ -86,7 +86,7 @@ class CloudViewer:
         with self._page:
             following = self._known is None or self._step.value == len(self._known)
             if self._known is None:
-                self._face(known)
+                self._face_scene(known)
             for index, view in enumerate(known.views):
                 self._add_frustum(index, view)
             self._known, self._cloud = known, cloud
@@ -110,7 +110,7 @@ class CloudViewer:
     ) -> None:
         self.close()
 
-    def _face(self, known: GlobalMap) -> None:
+    def _face_scene(self, known: GlobalMap) -> None:
         """A visitor first stands behind the first photographer, upright."""
         cam_to_world = known.cameras.cam_to_world.double()
         up = -cam_to_world[:, :3, 1].mean(0).numpy()
@@ -121,7 +121,7 @@ class CloudViewer:
         camera.look_at = np.zeros(3)  # the map's world has the scene at its origin
         camera.position = FIRST_DISTANCE * cam_to_world[0, :3, 3].numpy()
 
-    def _moved(self, event: Any) -> None:
+    def _on_slider_moved(self, event: Any) -> None:
         """A visitor moved a slider; where we did, `client_id` is None and we draw ourselves."""
         if event.client_id is not None:
             with self._page:

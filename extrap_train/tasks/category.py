@@ -106,7 +106,7 @@ def _opened(
     with claim(folder.path, manifest, resume=resume) as claimed:
         if not claimed.is_reused:
             claimed.begin()
-        opening = _opening(folder, config, console)
+        opening = _find_opening(folder, config, console)
         if not opening.is_finished:
             write_options(folder, config, at_least=_resumed_step(opening.checkpoint))
         point_latest(folder)
@@ -114,7 +114,7 @@ def _opened(
         yield opening
 
 
-def _opening(folder: RunFolder, config: TrainConfig, console: Console) -> Opening:
+def _find_opening(folder: RunFolder, config: TrainConfig, console: Console) -> Opening:
     finished = Finished.read(folder) if folder.summary.is_file() else None
     if finished is not None and finished.answers(config):
         if finished.has_its_model(folder):

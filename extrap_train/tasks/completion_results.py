@@ -15,7 +15,7 @@ from extrap_train.config import TrainConfig
 from extrap_train.data.sequences import Frame, FrameSequence
 from extrap_train.data.square_frames import load_held_out
 from extrap_train.data.synthetic import SyntheticScene
-from extrap_train.figures import colour_depth, contact_sheet, error_map, mark_holes
+from extrap_train.figures import colour_depth, draw_contact_sheet, error_map, mark_holes
 from extrap_train.gaussians.fit import Diverged
 from extrap_train.geometry.world_frame import WorldFrame
 from extrap_train.metrics import lpips_or_reason, psnr, quantised, ssim
@@ -86,7 +86,7 @@ def write_completed(
     _draw_views(done.known, folder / "views.png")
     done.seconds["export"] = time.perf_counter() - started
     started = time.perf_counter()
-    splats, no_splats = _splats(done, config, folder)
+    splats, no_splats = _fit_splats(done, config, folder)
     done.seconds["splats"] = time.perf_counter() - started
     started = time.perf_counter()
     held_out, missing = _compare_held_out(done, config, sequence, pipeline, folder)
@@ -114,7 +114,7 @@ def write_completed(
     write_summary(folder, summary)
     console.print(f"generated with {used or 'exact renderings of the scene'}")
     _print_what_was_added(done, summary, config, console)
-    _print(summary, console)
+    _print_summary(summary, console)
     console.print(f"pictures: {folder / 'growth.png'}\nresult: {folder}")
 
 
@@ -145,7 +145,7 @@ def _print_what_was_added(
         console.print("no view was generated: the photographs already stand all around")
 
 
-def _splats(
+def _fit_splats(
     done: Completed, config: TrainConfig, folder: Path
 ) -> tuple[dict[str, float] | None, dict[str, str]]:
     """The fitted Gaussians' numbers, or why there are none: the rest of the scene is whole."""
@@ -177,7 +177,7 @@ def _metrics(done: Completed, cloud: PointCloud) -> dict[str, dict[str, float]] 
 
 
 def _draw_views(known: GlobalMap, path: Path) -> None:
-    contact_sheet(
+    draw_contact_sheet(
         {
             "view": torch.stack([view.view.image for view in known.views]),
             "depth": colour_depth(torch.stack([view.depth for view in known.views])),
@@ -217,7 +217,7 @@ def _compare_held_out(
         warps.append(mark_holes(seen.image[None], seen.mask.float()[None])[0])
         masks.append(seen.mask.float())
     images, photos = quantised(torch.stack(made)), quantised(torch.stack([v.image for v in truth]))
-    contact_sheet(
+    draw_contact_sheet(
         {
             "warp of the inputs": torch.stack(warps),
             "generated": images,
@@ -261,7 +261,7 @@ def _elsewhere(known: GlobalMap, camera: Camera) -> list[int]:
     return [i for i in known.nearest(camera, len(known)) if not there[i]][:REFERENCES]
 
 
-def _print(summary: dict[str, Any], console: Console) -> None:
+def _print_summary(summary: dict[str, Any], console: Console) -> None:
     if summary["metrics"]:
         names = ("accuracy", "completeness", "f_score")
         table = Table("", *names, title="cloud against the truth, at 2 % of the object's size")

@@ -15,7 +15,7 @@ from extrap_train.diffusion.callbacks import ABOVE_BASELINES
 from extrap_train.diffusion.evaluation import Prediction, summarise
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.errors import InputError
-from extrap_train.figures import contact_sheet, curve, error_map, mark_holes
+from extrap_train.figures import draw_contact_sheet, error_map, mark_holes, plot_curve
 from extrap_train.runs import RunFolder, provenance
 from extrap_train.store.atomic import write_atomic
 from extrap_train.store.digests import folder_digest
@@ -96,7 +96,7 @@ def draw_views(prediction: Prediction, path: Path) -> None:
     """Reference, warp, output, truth and error, a row per view, named as in `validation.csv`."""
     batch, images = prediction.batch, prediction.images
     assert batch.warp is not None
-    contact_sheet(
+    draw_contact_sheet(
         {
             "reference": images["nearest"],
             "warp": mark_holes(batch.warp.image, batch.warp.mask),
@@ -117,7 +117,7 @@ def draw_curve(folder: RunFolder) -> None:
         rows = table[table[ABOVE_BASELINES].notna()]
         series = {"model": rows[ABOVE_BASELINES].tolist(), "best baseline": [0.0] * len(rows)}
         path = folder.samples / "curve.png"
-        curve(rows["step"].tolist(), series, "PSNR above the best baseline, dB", path)
+        plot_curve(rows["step"].tolist(), series, "PSNR above the best baseline, dB", path)
 
 
 def _table(validation: dict[str, dict[str, float]]) -> Table:

@@ -28,7 +28,7 @@ from extrap_train.diffusion.lora import (
 )
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError
-from extrap_train.figures import contact_sheet, curve, error_map, mark_holes
+from extrap_train.figures import draw_contact_sheet, error_map, mark_holes, plot_curve
 from extrap_train.metrics import Distance, lpips_or_reason
 from extrap_train.store import Outcome
 from extrap_train.store.atomic import write_atomic
@@ -223,7 +223,7 @@ def _measure(
     names = [view.name for view in targets]
     scores = score_images(images, truth, after.warp.mask, names, distance)
     write_atomic(folder / "held_out.csv", scores.to_csv(index=False).encode())
-    contact_sheet(
+    draw_contact_sheet(
         {
             "warp": mark_holes(after.warp.image, after.warp.mask),
             **images,
@@ -245,7 +245,7 @@ def _write(
     missing: dict[str, str],
 ) -> None:
     steps, errors = [list(column) for column in zip(*done.held_out_errors, strict=True)]
-    curve(steps, {"held-out pair": errors}, "denoising error", folder / "curve.png")
+    plot_curve(steps, {"held-out pair": errors}, "denoising error", folder / "curve.png")
     summary = {
         "generated_with": asdict(used),
         "inputs": read[0],

@@ -13,7 +13,7 @@ from torch import Tensor
 from extrap_train.config import SplatsConfig
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError
-from extrap_train.figures import contact_sheet, error_map
+from extrap_train.figures import draw_contact_sheet, error_map
 from extrap_train.gaussians.fit import fit_views
 from extrap_train.gaussians.gaussian_model import Gaussians
 from extrap_train.gaussians.gaussian_options import BACKGROUNDS, GaussianOptions
@@ -52,7 +52,7 @@ def write_fitted_splats(
     splats = read_splats(path)
     truth = torch.stack([view.image for view in views])
     drawn = quantised(_drawn(_inside(splats, world), known, gaussian_options))
-    contact_sheet(
+    draw_contact_sheet(
         {"view": truth, "splats": drawn, "error": error_map(drawn, truth)}, folder / "splats.png"
     )
     score = float(psnr(drawn, truth).mean())

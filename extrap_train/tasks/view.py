@@ -19,7 +19,13 @@ from extrap_train.data.square_frames import object_square
 from extrap_train.data.transforms_json import read_cameras
 from extrap_train.diffusion.generator import GeneratedViews
 from extrap_train.errors import InputError, did_you_mean
-from extrap_train.figures import contact_sheet, film, mark_holes, picture_names, save_picture
+from extrap_train.figures import (
+    draw_contact_sheet,
+    mark_holes,
+    picture_names,
+    save_picture,
+    write_film,
+)
 from extrap_train.geometry.orbits import LEAST_VIEWS, orbit_cameras
 from extrap_train.metrics import psnr, quantised
 from extrap_train.store.manifest import claim
@@ -217,12 +223,12 @@ def _write(
     warps = mark_holes(made.warp.image, made.warp.mask)
     if walk:
         for end in ("gif", "mp4"):
-            film(made.images, folder / f"orbit.{end}")
-            film(warps, folder / f"orbit_warp.{end}")
+            write_film(made.images, folder / f"orbit.{end}")
+            write_film(warps, folder / f"orbit_warp.{end}")
     for stem, image, warp in zip(picture_names(names), made.images, warps, strict=True):
         save_picture(image, folder / "views" / f"{stem}.png")
         save_picture(warp, folder / "views" / f"{stem}_warp.png")
     size = made.images.shape[-1]
     nearest = torch.stack([views[row[0]].resized(size, size).image for row in made.references])
     shown = {"nearest photo": nearest, "warp": warps, "view": made.images}
-    contact_sheet(shown, folder / "sheet.png")
+    draw_contact_sheet(shown, folder / "sheet.png")

@@ -12,8 +12,8 @@ from data_prep import prep_report
 from data_prep.prep_report import (
     correction_facts,
     coverage,
+    draw_pair_sheet,
     error_histogram,
-    pair_sheet,
     write_report,
 )
 from data_prep.preparation import prepare
@@ -65,7 +65,7 @@ def test_the_table_of_pairs_is_read_once_for_all_pictures(
     monkeypatch.setattr(
         PreparedData, "pairs", lambda self, split: splits.append(split) or read(self, split)
     )
-    pair_sheet(data, [0, 1, 2], tmp_path / "sheet.png")
+    draw_pair_sheet(data, [0, 1, 2], tmp_path / "sheet.png")
     assert splits == ["train"]
 
 
@@ -74,9 +74,9 @@ def test_the_rows_of_a_sheet_say_which_pairs_they_show(
 ) -> None:
     said: list[str] = []
     monkeypatch.setattr(
-        prep_report, "contact_sheet", lambda columns, path, captions: said.extend(captions)
+        prep_report, "draw_contact_sheet", lambda columns, path, captions: said.extend(captions)
     )
-    pair_sheet(data, [5, 2], tmp_path / "sheet.png")
+    draw_pair_sheet(data, [5, 2], tmp_path / "sheet.png")
     pairs = data.pairs("train")
     for number, (index, caption) in enumerate(zip([5, 2], said, strict=True), start=1):
         names = data.names(pairs.sequence[index])

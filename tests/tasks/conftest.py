@@ -38,7 +38,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def brief(measured_once: None, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Options of an adaptation that is over at once and draws no curve."""
-    monkeypatch.setattr("extrap_train.tasks.scene.curve", lambda *_: None)
+    monkeypatch.setattr("extrap_train.tasks.scene.plot_curve", lambda *_: None)
     few = ["lora.batch_size=1", "lora.virtual_references=2", "validation.examples=1"]
     return ["minutes=0.2", "lora.steps=1", "lora.validate_every=1", "sampler.steps=1", *few]
 
