@@ -51,7 +51,7 @@ class Option:
     default: Any
     declared: Declared
     has_text_entries: bool = False
-    """Of a mapping: whether its values are texts."""
+    """Whether the values of a mapping are texts."""
 
     @property
     def must_be(self) -> str:

@@ -19,7 +19,7 @@ from extrap_train.store.atomic import write_atomic
 from extrap_train.terminal import DRAWN_EVERY_S, progress
 
 ABOVE_BASELINES = "validation/above_baselines_db"
-"""Of a validation's metrics, what the bar shows."""
+"""The metric of a validation that the progress bar shows."""
 
 
 class MetricsTable(Logger):

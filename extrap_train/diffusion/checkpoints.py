@@ -32,9 +32,9 @@ _ENTRIES: dict[str, type] = {
     "callbacks": dict,
     "loops": dict,
 }
-"""What Lightning cannot resume without."""
+"""Entries of a checkpoint that Lightning cannot resume without."""
 _AVERAGE = ("current_model_state", "averaging_state")
-"""Likewise, where weights are averaged; Lightning itself would go on without the average."""
+"""Entries needed where weights are averaged; Lightning itself would go on without the average."""
 _PIECE_BYTES = 2**20
 
 

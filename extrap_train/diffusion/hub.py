@@ -24,7 +24,7 @@ from extrap_train.diffusion.packaged import packaged_weights
 from extrap_train.errors import InputError
 
 FILES = ("*.safetensors", "*.json")
-"""Of a repository, what is uploaded and downloaded: nothing that could run code."""
+"""Files of a repository that are uploaded and downloaded: nothing that could run code."""
 HUB_FAILURES: tuple[Any, ...] = (*HfHubHTTPError.__bases__, OSError, HFValidationError)
 """What the hub's client raises: errors of httpx or requests, by its version, and of files."""
 _NAME = re.compile(

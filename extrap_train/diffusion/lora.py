@@ -55,7 +55,7 @@ class AdapterRecord(AdapterOrigin):
 
 @dataclass(frozen=True)
 class _SavedOptions:
-    """Of peft's options what `add_adapter` sets; others name modules to import."""
+    """The options of peft that `add_adapter` sets; others name modules to import."""
 
     peft_type: Literal["LORA"]
     r: Annotated[int, Field(ge=1, le=_MAX_RANK)]

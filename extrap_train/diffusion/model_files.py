@@ -99,7 +99,7 @@ def _state(model: ExtrapolationModel) -> dict[str, Tensor]:
 
 
 def _digest(folder: Path) -> str:
-    """Of all weights in a model's folder."""
+    """SHA-256 of all weights in a model's folder."""
     files = sorted(folder.rglob("*.safetensors"))
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
 

@@ -19,7 +19,7 @@ from extrap_train.config import PACKAGED_MODELS, packaged_names
 from extrap_train.errors import InputError
 
 _LEVELS = 7
-"""Of each sign: −7 … 7 in four bits."""
+"""Levels of each sign: −7 … 7 in four bits."""
 _CLIPS = torch.linspace(0.35, 1.0, 14)
 """Shares of a channel's largest difference among which its range is chosen."""
 _BITS, _SCALE = ":bits", ":scale"

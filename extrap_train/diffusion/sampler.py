@@ -24,7 +24,7 @@ MultistepSolver = Any
 _MULTISTEP = {"dpmpp": DPMSolverMultistepScheduler, "unipc": UniPCMultistepScheduler}
 _FEWEST_LEADING = 50
 _PURE_NOISE = -4.0
-"""Of log α/σ: what lies below is as good as pure noise."""
+"""log α/σ below which a latent counts as pure noise."""
 _SCHEDULE_KEYS = (
     "num_train_timesteps",
     "beta_start",

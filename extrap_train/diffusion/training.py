@@ -30,7 +30,7 @@ from extrap_train.processes import gathered
 from extrap_train.views import PairBatch
 
 _STEPS_A_ROW = 20
-"""Of `metrics.csv` between two validations."""
+"""Steps per row of `metrics.csv` between two validations."""
 
 
 class CategoryTraining(lightning.LightningModule):

@@ -33,7 +33,7 @@ class Split:
     train: tuple[str, ...]
     test: tuple[str, ...]
     seed: int | None = None
-    """Of rendered captures: the same name under another seed is another object."""
+    """Seed of rendered captures: the same name under another seed is another object."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What the command line can do: each task composes the other rooms and owns no mathematics."""
+"""One module per `task=`. Tasks call the other packages and contain no algorithms."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -20,7 +20,7 @@ LEAST_VIEWS = 3
 
 
 def run(config: TrainConfig) -> None:
-    """Draw `check.png` in place of an earlier one, and print one line for each thing found."""
+    """Draw `check.png`, replacing an earlier one, and print one line for each thing found."""
     sequence = open_sequence(config)
     count = config.inputs or min(len(sequence.frames), MOST_VIEWS)
     chosen = select_input_frames(sequence, config.input_frames, count)

@@ -43,7 +43,7 @@ from extrap_train.tasks.splats import write_fitted_splats
 from extrap_train.views import Camera, stack_cameras
 
 _NOTHING_SHARE = 0.02
-"""Of the cloud's points: with fewer, the generated views added next to nothing."""
+"""Share of the cloud's points: with fewer, the generated views added next to nothing."""
 _NO_MESH = "the views show no surface near the point that the cameras look at"
 SUBDIVIDE = 3
 """Points that a pixel of the cloud becomes along each axis."""
@@ -58,7 +58,7 @@ class Completed:
     world: WorldFrame
     truth: SyntheticScene | None
     seconds: dict[str, float]
-    """Of the inputs and the views, whichever run made them."""
+    """Seconds spent on the inputs and the views, whichever run made them."""
 
 
 def write_completed(

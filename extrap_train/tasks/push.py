@@ -90,9 +90,7 @@ def _all_seen(folder: Path, split: Mapping[str, Split]) -> dict[str, Split]:
 
 
 def _model_folder(config: TrainConfig) -> Path:
-    """Of the run, model folder or packaged model that `weights` names; by default of the latest
-    run.
-    """
+    """Folder of the run or (packaged) model that `weights` names, by default the latest run."""
     if config.weights is None:
         return existing_run(config).model
     if config.weights in packaged_names():

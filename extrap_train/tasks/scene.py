@@ -154,7 +154,7 @@ def _frames_read(config: TrainConfig, sequence: FrameSequence) -> list[Frame]:
 
 
 def _options(config: TrainConfig) -> dict[str, Any]:
-    """Of an adapter and its numbers."""
+    """The options that decide an adapter and its scores."""
     adapting = {
         "lora": asdict(config.lora),
         "minutes": config.minutes,
@@ -180,7 +180,7 @@ def _origin(
 
 @dataclass(frozen=True)
 class _Finished:
-    """Of the summary, what a whole result must say."""
+    """The part of a summary that a whole result must have."""
 
     adaptation: Adaptation
 

@@ -55,7 +55,7 @@ from extrap_train.terminal import terminal
 from extrap_train.views import Camera, View, stack_cameras
 
 _UNSEEN_SHARE = 0.02
-"""Of a view that the inputs show: with less it is as good as turned away."""
+"""Share of a view that the inputs show: with less it is as good as turned away."""
 _PICTURES_PER_VIEW = 8
 """View and warp, in files of their own, in both films and on the sheet."""
 
@@ -68,7 +68,7 @@ class _Query:
     cameras: Camera | None
     """None on an orbit, which follows from the inputs."""
     photograph: View | None
-    """Of a frame that is asked for, as it was taken."""
+    """Photograph of the frame that is asked for, as it was taken."""
 
 
 @dataclass(frozen=True)
