@@ -14,8 +14,8 @@ from data_prep.drop_summary import group_reasons
 from data_prep.filter import judge_all
 from data_prep.model_cache import PrepModels, release_models
 from data_prep.sequence_job import NO_SPACE, PrepContext, SequenceJob, prepare_sequence
-from data_prep.split import Split, split_sequences
-from data_prep.tables import Outcome, write_results
+from data_prep.split import SequenceSplit, split_sequences
+from data_prep.tables import SequenceOutcome, write_results
 from extrap_train.config import DepthConfig, MatcherConfig, PrepConfig
 from extrap_train.data.prepared import FORMAT, PreparedData
 from extrap_train.data.sequences import FrameSequence
@@ -157,7 +157,9 @@ def _is_finished(plan: _Plan, folder: Path, retry: bool) -> bool:
     return not damaged
 
 
-def _make_all(plan: _Plan, launcher: Launcher, progress: bool) -> tuple[list[Outcome], Split]:
+def _make_all(
+    plan: _Plan, launcher: Launcher, progress: bool
+) -> tuple[list[SequenceOutcome], SequenceSplit]:
     """Every sequence's outcome, and the split of those that are kept.
 
     Who is tested on depends on who is left, so after failures the split is made anew, and what it
@@ -165,7 +167,8 @@ def _make_all(plan: _Plan, launcher: Launcher, progress: bool) -> tuple[list[Out
     """
     verdicts = judge_all([sequence for sequence, _ in plan.captures], plan.context.options)
     outcomes = [
-        Outcome(*capture, verdict) for capture, verdict in zip(plan.captures, verdicts, strict=True)
+        SequenceOutcome(*capture, verdict)
+        for capture, verdict in zip(plan.captures, verdicts, strict=True)
     ]
     made: dict[str, str] = {}
     while True:
@@ -191,7 +194,7 @@ def _make_all(plan: _Plan, launcher: Launcher, progress: bool) -> tuple[list[Out
                 outcomes[number] = _left_out(outcomes[number], reason)
 
 
-def _left_out(outcome: Outcome, reason: str | Died) -> Outcome:
+def _left_out(outcome: SequenceOutcome, reason: str | Died) -> SequenceOutcome:
     """What becomes of a sequence that could not be prepared; says so."""
     if isinstance(reason, Died):
         reason = f"sequence {outcome.name}: {reason.reason}"
@@ -200,7 +203,7 @@ def _left_out(outcome: Outcome, reason: str | Died) -> Outcome:
     return replace(outcome, verdict=verdict, failed=True)
 
 
-def _nothing_left(outcomes: list[Outcome]) -> str:
+def _nothing_left(outcomes: list[SequenceOutcome]) -> str:
     if not outcomes:
         return "no sequence to prepare; check the category and the data set's root"
     groups = group_reasons(o.verdict.reason.removeprefix(f"sequence {o.name}: ") for o in outcomes)
@@ -217,7 +220,7 @@ def _nothing_left(outcomes: list[Outcome]) -> str:
     )
 
 
-def _is_damaged(outcome: Outcome) -> bool:
+def _is_damaged(outcome: SequenceOutcome) -> bool:
     """Whether no option could keep the sequence."""
     sequence = outcome.sequence
     return outcome.failed or bool(too_many_unusable(sequence.left_out, sequence))

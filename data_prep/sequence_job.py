@@ -84,7 +84,7 @@ class SequenceJob:
     context: PrepContext
     sequence: FrameSequence
     role: str
-    """`train`, `test` or `train and test` (`split.Split.role`)."""
+    """`train`, `test` or `train and test` (`split.SequenceSplit.role`)."""
     capture_key: str
     """What its frames are made from (`CaptureKeys.frames_key`), but for the role."""
     progress: bool = False

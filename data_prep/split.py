@@ -14,7 +14,7 @@ LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Split:
+class SequenceSplit:
     """Sequences, as `category/name`, by what they are for."""
 
     train: tuple[str, ...]
@@ -39,7 +39,7 @@ class Split:
         return json.dumps({**content, "sha256": digest}, indent=1) + "\n"
 
 
-def split_sequences(sequences: Sequence[str], test: Collection[str] | int) -> Split:
+def split_sequences(sequences: Sequence[str], test: Collection[str] | int) -> SequenceSplit:
     """Divide every category's sequences (`category/name`).
 
     `test` names the test sequences (by name, or with the category), or says how many a category
@@ -61,7 +61,7 @@ def split_sequences(sequences: Sequence[str], test: Collection[str] | int) -> Sp
         else:
             tested += _select_named(category, names, test)
     train = tuple(s for s in sorted(sequences) if s not in {*tested, *lone})
-    return Split(train, tuple(sorted(tested)), tuple(lone))
+    return SequenceSplit(train, tuple(sorted(tested)), tuple(lone))
 
 
 def _select_named(category: str, names: list[str], test: Collection[str]) -> list[str]:

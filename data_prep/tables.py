@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 
 from data_prep.filter import Verdict
 from data_prep.sequence_job import PrepContext, SequenceJob, reference_frames
-from data_prep.split import Split
+from data_prep.split import SequenceSplit
 from extrap_train.data.frame_files import SealedTable, table_digest
 from extrap_train.data.prepared import FORMAT, TABLES
 from extrap_train.data.sequences import FrameSequence
@@ -29,7 +29,7 @@ _ROWS_AT_A_TIME = 50_000
 
 
 @dataclass(frozen=True)
-class Outcome:
+class SequenceOutcome:
     """What became of a sequence."""
 
     sequence: FrameSequence
@@ -52,8 +52,8 @@ class Outcome:
 def write_results(
     folder: Path,
     context: PrepContext,
-    outcomes: list[Outcome],
-    split: Split,
+    outcomes: list[SequenceOutcome],
+    split: SequenceSplit,
     facts: Mapping[str, Any],
 ) -> None:
     """All tables, then the manifest, whose presence marks them complete.
@@ -129,7 +129,10 @@ def _read(sealed: SealedTable) -> pa.Table:
 
 
 def _sequence_row(
-    outcome: Outcome, split: Split, frames: Counter[str], pairs: Counter[tuple[str, str]]
+    outcome: SequenceOutcome,
+    split: SequenceSplit,
+    frames: Counter[str],
+    pairs: Counter[tuple[str, str]],
 ) -> dict[str, Any]:
     """`frames` counts those that are stored; of a dropped sequence, all that it has."""
     verdict, sequence = outcome.verdict, outcome.sequence

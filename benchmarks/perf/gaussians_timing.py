@@ -9,7 +9,7 @@ from torch import Tensor
 from benchmarks.perf.timing import Row, compare, devices
 from benchmarks.perf.warp_timing import orbit_camera
 from extrap_train.gaussians.density import rotation_matrices
-from extrap_train.gaussians.losses import photograph, photometric_loss
+from extrap_train.gaussians.losses import photometric_loss, prepare_truth
 from extrap_train.gaussians.projection import LOW_PASS, NEAR_PLANE
 from extrap_train.gaussians.projection_numba import MIN_ALPHA
 from extrap_train.gaussians.rasterize import rasterizer
@@ -76,7 +76,7 @@ def _train(draw: Draw, inputs: list[Tensor]) -> Callable[[], Float[Tensor, "h w 
     means, quats, scales, opacities, colors = inputs
     free = [means, quats, scales.log(), opacities.logit(), colors]
     leaves = [x.requires_grad_() for x in free]
-    grey = photograph(torch.full_like(draw(*inputs).detach().permute(2, 0, 1), 0.5))
+    grey = prepare_truth(torch.full_like(draw(*inputs).detach().permute(2, 0, 1), 0.5))
     optimiser = torch.optim.Adam(leaves, lr=1e-3, fused=True)
 
     def once() -> Float[Tensor, "h w 3"]:

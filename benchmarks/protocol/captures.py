@@ -26,7 +26,7 @@ from extrap_train.data.sequences import NO_CATEGORY, FrameSequence
 from extrap_train.data.synthetic import build_scene, surface_points
 from extrap_train.data.synthetic.capture import synthetic_sequence
 from extrap_train.data.transforms_json import TRANSFORMS, read_transforms
-from extrap_train.diffusion.leakage import Training, trainings_of
+from extrap_train.diffusion.leakage import TrainedCaptures, trainings_of
 from extrap_train.errors import InputError
 from extrap_train.store.manifest import Split
 from extrap_train.store.records import read_record
@@ -44,7 +44,7 @@ class Capture:
     surface: Callable[[], TrueSurface] | None = None
 
 
-Trained = Sequence[tuple[str, Training, bool]]
+Trained = Sequence[tuple[str, TrainedCaptures, bool]]
 """Methods by name with what their weights, or those that they started from, were trained on; and
 whether it is the weights themselves.
 """

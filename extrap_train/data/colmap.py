@@ -24,7 +24,7 @@ from extrap_train.data.listed_photographs import (
     sequence_of_photographs,
 )
 from extrap_train.data.paths import MAX_PATH_BYTES, check_relative
-from extrap_train.data.sequences import FrameSequence, PointCloud
+from extrap_train.data.sequences import FrameSequence, PointFile
 from extrap_train.errors import InputError
 from extrap_train.geometry.colmap import (
     CAMERA_MODELS,
@@ -123,7 +123,7 @@ def read_model(model: Path, images: Path, name: str, upright: bool = False) -> F
             unusable.append(entry.fault or str(error))
         else:
             listed.append(Listed(path, partial(_photograph, entry, cameras, cameras_file, upright)))
-    cloud = PointCloud(model, POINT_CLOUD)
+    cloud = PointFile(model, POINT_CLOUD)
     return sequence_of_photographs(
         ListedFiles(images), name, listed, images_file, COLMAP_POSES, unusable, cloud
     )

@@ -21,7 +21,7 @@ from extrap_train.data.listed_files import (
     MaskFiles,
     normal_path,
 )
-from extrap_train.data.sequences import NO_CATEGORY, FrameSequence, Photograph, PointCloud
+from extrap_train.data.sequences import NO_CATEGORY, FrameSequence, Photograph, PointFile
 from extrap_train.errors import InputError
 from extrap_train.geometry.lens import Lens
 from extrap_train.views import Camera, stack_poses
@@ -64,7 +64,7 @@ def sequence_of_photographs(
     description: Path,
     convention: PoseConvention,
     unusable: Sequence[str],
-    point_cloud: PointCloud | None = None,
+    point_cloud: PointFile | None = None,
 ) -> FrameSequence:
     """A sequence of the photographs below `files.root`, in the order of their paths.
 

@@ -102,7 +102,7 @@ class Photograph:
 
 
 @dataclass(frozen=True)
-class PointCloud:
+class PointFile:
     """A file of points as a description lists it, which need not be there."""
 
     root: Path
@@ -131,4 +131,4 @@ class FrameSequence:
     viewpoint_quality: float | None = None
     """CO3D's score of its camera poses; None where the capture has none."""
     point_cloud_quality: float | None = None
-    point_cloud: PointCloud | None = None
+    point_cloud: PointFile | None = None

@@ -22,7 +22,7 @@ from extrap_train.data.listed_photographs import (
     sequence_of_photographs,
 )
 from extrap_train.data.paths import check_relative
-from extrap_train.data.sequences import FrameSequence, PointCloud
+from extrap_train.data.sequences import FrameSequence, PointFile
 from extrap_train.errors import InputError
 from extrap_train.geometry.opengl import world_to_cam_from_opengl
 from extrap_train.views import Camera, stack_cameras
@@ -63,7 +63,7 @@ def read_transforms(folder: Path) -> FrameSequence:
         file,
         OPENGL_POSES,
         unusable,
-        point_cloud=PointCloud(folder, check_relative(str(cloud), file)) if cloud else None,
+        point_cloud=PointFile(folder, check_relative(str(cloud), file)) if cloud else None,
     )
 
 

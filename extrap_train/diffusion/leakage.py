@@ -14,7 +14,7 @@ from extrap_train.store.manifest import MANIFEST, Split, read_manifest
 
 
 @dataclass(frozen=True)
-class Training:
+class TrainedCaptures:
     """The captures of one category that went into a model's training, and those held out."""
 
     model: str
@@ -38,7 +38,7 @@ class Training:
         return sorted({*held_out.test} & {*seen.train})
 
 
-def trainings_of(weights: str | None) -> Iterator[Training]:
+def trainings_of(weights: str | None) -> Iterator[TrainedCaptures]:
     """What weights and those that they started from were trained on, as far as their runs say.
 
     The manifest lies beside the model's folder, or within that of a repository. Published weights
@@ -55,5 +55,5 @@ def trainings_of(weights: str | None) -> Iterator[Training]:
         for place in [place for place in places if (place / MANIFEST).is_file()][:1]:
             manifest = read_manifest(place, "restore it from its run")
             for category, split in manifest.split.items():
-                yield Training(weights, category, split)
+                yield TrainedCaptures(weights, category, split)
         weights = saved_config(folder).start

@@ -33,7 +33,7 @@ def blur(maps: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
 
 
 @dataclass(frozen=True)
-class Photograph:
+class PreparedTruth:
     """A truth with the moments of its windows, which stay the same over a whole training."""
 
     image: Float[Tensor, "3 h w"]
@@ -41,13 +41,13 @@ class Photograph:
     variance: Float[Tensor, "3 h w"]
 
 
-def photograph(image: Float[Tensor, "3 h w"]) -> Photograph:
+def prepare_truth(image: Float[Tensor, "3 h w"]) -> PreparedTruth:
     """Prepare a photograph to be compared with."""
     mean = blur(image)
-    return Photograph(image, mean, blur(image.square()) - mean.square())
+    return PreparedTruth(image, mean, blur(image.square()) - mean.square())
 
 
-def ssim_map(image: Float[Tensor, "3 h w"], truth: Photograph) -> Float[Tensor, "3 h w"]:
+def ssim_map(image: Float[Tensor, "3 h w"], truth: PreparedTruth) -> Float[Tensor, "3 h w"]:
     """Structural similarity (Wang et al., 2004) around each pixel, per channel; range 1."""
     mean, square, product = blur(torch.stack([image, image.square(), image * truth.image]))
     variance = square - mean.square()
@@ -57,7 +57,7 @@ def ssim_map(image: Float[Tensor, "3 h w"], truth: Photograph) -> Float[Tensor, 
 
 
 def photometric_loss(
-    image: Float[Tensor, "3 h w"], truth: Photograph, ssim_weight: float, l1_weight: float
+    image: Float[Tensor, "3 h w"], truth: PreparedTruth, ssim_weight: float, l1_weight: float
 ) -> Float[Tensor, ""]:
     """`l1_weight · L1 + ssim_weight · (1 − SSIM)`; 3DGS's weights add to 1, DNGaussian's do not."""
     l1 = (image - truth.image).abs().mean()

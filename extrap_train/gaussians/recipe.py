@@ -23,7 +23,7 @@ from extrap_train.gaussians.init import (
     random_points,
     triangulate_points,
 )
-from extrap_train.gaussians.losses import photograph, photometric_loss
+from extrap_train.gaussians.losses import photometric_loss, prepare_truth
 from extrap_train.gaussians.optimiser import GaussianOptimiser
 from extrap_train.gaussians.rasterize import Drawing, draw, rasterizer
 from extrap_train.gaussians.training_scene import TrainingScene
@@ -66,7 +66,7 @@ class Recipe:
         self._rasterize = rasterizer(options.rasterizer)
         self.cameras = [view.camera.to(options.device) for view in scene.views]
         """The inputs' cameras on the device of the fit; `scene` stays on the CPU."""
-        self._photographs = [photograph(view.image.to(options.device)) for view in scene.views]
+        self._photographs = [prepare_truth(view.image.to(options.device)) for view in scene.views]
 
     def initial_points(self) -> Points:
         """The points that training starts from, on the CPU; the record says which."""

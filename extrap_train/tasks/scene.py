@@ -36,7 +36,7 @@ from extrap_train.store.digests import file_digest
 from extrap_train.store.manifest import Claim, claim
 from extrap_train.store.records import read_record, write_summary
 from extrap_train.tasks.scene_inputs import (
-    SceneInputs,
+    InputViews,
     input_frames,
     label_of,
     nothing_kept,
@@ -167,7 +167,7 @@ def _options(config: TrainConfig) -> dict[str, Any]:
 def _origin(
     config: TrainConfig,
     sequence: FrameSequence,
-    inputs: SceneInputs,
+    inputs: InputViews,
     used: UsedWeights,
 ) -> AdapterOrigin:
     learnt = {view.name for view in inputs.views}
@@ -199,7 +199,7 @@ def _is_whole(folder: Path) -> bool:
 def _generate(
     model: ExtrapolationModel,
     config: TrainConfig,
-    inputs: SceneInputs,
+    inputs: InputViews,
     targets: list[View],
 ) -> GeneratedViews | None:
     if not targets:

@@ -24,7 +24,7 @@ _MIB = 2**20
 
 
 @dataclass(frozen=True)
-class SceneInputs:
+class InputViews:
     """A scene's chosen views with depth, and its frames that are left over."""
 
     views: list[View]
@@ -74,7 +74,7 @@ def input_frames(
 
 def open_inputs(
     config: TrainConfig, sequence: FrameSequence, image_size: int, query: str | None = None
-) -> SceneInputs:
+) -> InputViews:
     """The scene's input views at this size; depth comes from these views alone.
 
     The frame called `query` is none of them, so that it can be compared with, unless
@@ -88,7 +88,7 @@ def open_inputs(
             f"input_frames: {lost[0]} cannot be used, as the warning says; mend it or name another"
         )
     others = [frame for frame in sequence.frames if frame.name not in names]
-    return SceneInputs(views, others)
+    return InputViews(views, others)
 
 
 def frame_digest(frame: Frame) -> str:

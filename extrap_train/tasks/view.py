@@ -31,7 +31,7 @@ from extrap_train.metrics import psnr, quantised
 from extrap_train.store.manifest import claim
 from extrap_train.store.records import write_record
 from extrap_train.tasks.scene_inputs import (
-    SceneInputs,
+    InputViews,
     input_frames,
     label_of,
     nothing_kept,
@@ -145,7 +145,7 @@ def _print_shares(made: GeneratedViews, names: list[str], console: Console) -> N
 def _compare(
     made: GeneratedViews,
     truth: View | None,
-    inputs: SceneInputs,
+    inputs: InputViews,
     config: TrainConfig,
     sequence: FrameSequence,
 ) -> tuple[float | None, str]:

@@ -5,7 +5,7 @@ import torch
 from skimage.metrics import structural_similarity
 from torch.nn import functional
 
-from extrap_train.gaussians.losses import blur, photograph, photometric_loss, ssim_map
+from extrap_train.gaussians.losses import blur, photometric_loss, prepare_truth, ssim_map
 
 
 def _pair(height: int = 40, width: int = 32) -> tuple[torch.Tensor, torch.Tensor]:
@@ -20,7 +20,7 @@ def test_ssim_is_scikit_images_away_from_the_border():
         image.numpy(), truth.numpy(), channel_axis=0, data_range=1.0, gaussian_weights=True,
         sigma=1.5, use_sample_covariance=False, full=True,
     )  # fmt: skip
-    found = ssim_map(image, photograph(truth))
+    found = ssim_map(image, prepare_truth(truth))
     inside = (slice(None), slice(5, -5), slice(5, -5))
     np.testing.assert_allclose(found[inside].numpy(), expected[inside], atol=2e-5)
 
@@ -35,7 +35,7 @@ def test_the_window_is_a_zero_padded_convolution():
 
 def test_equal_images_lose_nothing_and_weights_are_those_given():
     image, truth = _pair()
-    prepared = photograph(truth)
+    prepared = prepare_truth(truth)
     assert float(photometric_loss(truth, prepared, 0.2, 0.8)) < 1e-6
     l1 = (image - truth).abs().mean()
     torch.testing.assert_close(photometric_loss(image, prepared, 0.0, 1.0), l1)
@@ -45,7 +45,7 @@ def test_equal_images_lose_nothing_and_weights_are_those_given():
 
 def test_gradients_are_right():
     image, truth = (each[:, :12, :12].double() for each in _pair())
-    prepared = photograph(truth)
+    prepared = prepare_truth(truth)
     assert torch.autograd.gradcheck(
         lambda x: photometric_loss(x, prepared, 0.2, 0.8), image.requires_grad_(), eps=1e-6
     )

@@ -15,7 +15,7 @@ from extrap_train.config import (
     TrainConfig,
     packaged_names,
 )
-from extrap_train.diffusion.leakage import Training
+from extrap_train.diffusion.leakage import TrainedCaptures
 from extrap_train.diffusion.packaged import packaged_weights
 from extrap_train.errors import InputError
 from extrap_train.store.manifest import MANIFEST, Manifest, Split
@@ -57,12 +57,12 @@ def test_a_capture_leaks_if_it_is_held_out_here_and_trained_on_there(
     seen: Split, leaked: list[str]
 ) -> None:
     held_out = Split("synthetic", ("0002", "0003"), ("0000", "0001"), seed=0)
-    assert Training("m", "hydrant", seen).find_leaks("hydrant", held_out) == leaked
-    assert Training("m", "apple", seen).find_leaks("hydrant", held_out) == []
+    assert TrainedCaptures("m", "hydrant", seen).find_leaks("hydrant", held_out) == leaked
+    assert TrainedCaptures("m", "apple", seen).find_leaks("hydrant", held_out) == []
 
 
 def test_captures_of_co3d_are_the_same_in_every_category() -> None:
-    training = Training("m", "hydrant", Split("co3d", ("106_1_2",), ()))
+    training = TrainedCaptures("m", "hydrant", Split("co3d", ("106_1_2",), ()))
     assert training.find_leaks("apple", Split("co3d", (), ("106_1_2",))) == ["106_1_2"]
 
 

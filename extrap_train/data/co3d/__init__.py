@@ -21,7 +21,7 @@ from extrap_train.data.co3d.annotations import (
     read_sequence_annotations,
 )
 from extrap_train.data.co3d.frame_columns import Co3dFrames, is_blackened
-from extrap_train.data.sequences import Frame, FrameSequence, PointCloud
+from extrap_train.data.sequences import Frame, FrameSequence, PointFile
 from extrap_train.errors import InputError, did_you_mean
 
 FRAME_ANNOTATIONS = "frame_annotations.jgz"
@@ -183,5 +183,5 @@ def _sequence(
         left_out=tuple(left_out),
         viewpoint_quality=details.viewpoint_quality if details else None,
         point_cloud_quality=details.point_cloud_quality if details else None,
-        point_cloud=PointCloud(root, cloud) if cloud else None,
+        point_cloud=PointFile(root, cloud) if cloud else None,
     )
