@@ -42,7 +42,7 @@ class CommandOptions:
     """The options of one command."""
 
     program: str
-    """As it is started."""
+    """How the command is started."""
     config_name: str
     """Its file in `conf/`."""
     tree: type

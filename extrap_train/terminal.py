@@ -14,7 +14,7 @@ from rich.text import Text
 T = TypeVar("T")
 
 DRAWN_EVERY_S = 0.25
-"""On a terminal."""
+"""Least seconds between two drawings of a bar on a terminal."""
 LINE_EVERY_S = 10.0
 """A bar writes at most one line in this time where the output is not a terminal."""
 LINE_EVERY_SHARE = 0.05

@@ -58,7 +58,7 @@ def own_choices(tmp_path: Path) -> Path:
             ["category=hydrant", "model.image_size=96"],
             "give prep.image_size=192",
         ),
-        (["category=hydrant", "model.patch=7"], "no multiple of 56"),
+        (["category=hydrant", "model.patch=7"], "not a multiple of 56"),
         (["category=hydrant", "data=co3d"], "give data.root=FOLDER"),
         (
             ["category=hydrant", "model=small_megascenes", "model.geometry=true"],
@@ -200,8 +200,8 @@ def test_data_prep_takes_threads_for_its_processes(
 @pytest.mark.parametrize(
     ("content", "expected"),
     [
-        ("name: [vase\n", ("mine.yaml, line 2", "no valid YAML")),
-        ("name: vase\n\tmembers: []\n", ("mine.yaml, line 2", "no valid YAML")),
+        ("name: [vase\n", ("mine.yaml, line 2", "not valid YAML")),
+        ("name: vase\n\tmembers: []\n", ("mine.yaml, line 2", "not valid YAML")),
         ("defaults: [category_schema]\ncolour: 3\n", ("category/mine.yaml", "category.colour")),
     ],
 )

@@ -24,7 +24,7 @@ _HARD_OPACITY = 0.95
 _LOCAL_WEIGHT, _GLOBAL_WEIGHT = 0.1, 1.0
 """Weights of the losses on depth normalised by the patch, and by the image."""
 _DEPTH_TOLERANCE = 0.01
-"""Smaller differences of depth are let be."""
+"""Smaller differences of depth cost nothing."""
 _SMALLEST_PATCH, _LARGEST_PATCH = 5, 17
 """Sides in pixels; each term draws its own."""
 _COARSEST_CELLS, _FINEST_CELLS, _BOUND = 16, 512, 3.0

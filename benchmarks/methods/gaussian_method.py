@@ -28,7 +28,7 @@ class GaussianMethod(GaussianOptions):
     """What the method does in the training loop."""
 
     def weight_files(self, category: str) -> Sequence[Path]:
-        """None."""
+        """No files: nothing is pre-trained."""
         return ()
 
     def fit_scene(self, inputs: SceneInputs) -> Fit:

@@ -26,7 +26,7 @@ class NearestPhoto:
     """The input photograph nearest to the target, as it is."""
 
     def weight_files(self, category: str) -> Sequence[Path]:
-        """None."""
+        """No files: nothing is trained."""
         return ()
 
     def synthesize(self, inputs: SceneInputs) -> Synthesis:
@@ -49,7 +49,7 @@ class InpaintedWarp:
     references: int = option(3, "most inputs that a target is warped from", low=1)
 
     def weight_files(self, category: str) -> Sequence[Path]:
-        """None."""
+        """No files: nothing is trained."""
         return ()
 
     def synthesize(self, inputs: SceneInputs) -> Synthesis:

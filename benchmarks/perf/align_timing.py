@@ -27,7 +27,7 @@ Noise = Callable[[Float[Tensor, "h w"], torch.Generator], Float[Tensor, "h w"]]
 
 
 def clean(depth: Float[Tensor, "h w"], generator: torch.Generator) -> Float[Tensor, "h w"]:
-    """As it is."""
+    """The depth without noise."""
     return depth
 
 

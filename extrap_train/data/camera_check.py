@@ -40,7 +40,8 @@ LEAST_SHARE, NEARLY_ALL = 1 / 3, 0.9
 """Shares of cameras that look at one point: too few below the first, enough from the second on to
 name a convention."""
 CLEARLY_RAD = np.deg2rad(5)
-"""By so much, and twofold, must another convention bring the axes nearer to one point."""
+"""Another convention fits only if the axes miss one point by more than this angle plus twice what
+they miss it by under that convention."""
 
 ROTATION_TOLERANCE = 1e-3
 """Largest deviation of R Rᵀ from the identity; rotations stored as float32 stay below 1e-5."""
@@ -56,7 +57,7 @@ fills, the longest in its longer one."""
 LARGEST_OFFSET = 0.25
 """Largest offset of a principal point from the photograph's middle, as a share of each side."""
 NORMALISED_FOCAL = 5.0
-"""In pixels: a photograph's focal length below it is one in widths."""
+"""Focal length in pixels below which it must be given in widths of the picture."""
 
 
 def is_degenerate(camera: Camera) -> Bool[Tensor, "*b"]:

@@ -44,7 +44,7 @@ from extrap_train.views import Camera, ViewPair
 
 FORMAT = 5
 UNTOUCHED = -1
-"""In place of the number of a flow: the warp of that pair stays as it is."""
+"""Flow number of a pair without a flow: its warp stays as it is."""
 _REPEATED = ("sequence", "split", "uncorrected")
 """Columns whose words come again row after row: kept as codes, as a million pairs have two million
 such words, which would take a quarter of a gigabyte.

@@ -42,7 +42,7 @@ class PreparedTruth:
 
 
 def prepare_truth(image: Float[Tensor, "3 h w"]) -> PreparedTruth:
-    """Prepare a photograph to be compared with."""
+    """Compute once what comparing pictures with a photograph needs."""
     mean = blur(image)
     return PreparedTruth(image, mean, blur(image.square()) - mean.square())
 

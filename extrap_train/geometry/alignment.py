@@ -168,7 +168,7 @@ def _procrustes(
 
 
 def _trust(spread: Float[Tensor, " e"], usable: Bool[Tensor, " e"]) -> Float[Tensor, " e"]:
-    """Less for an edge that fits far worse than most do; no more for one that fits better.
+    """Weight of each edge: less if it fits far worse than most do, no more if it fits better.
 
     A good fit to the known view proves nothing: smooth errors vanish in it and stay in the new one.
     """
@@ -230,7 +230,7 @@ def _biweight(ratio: Tensor) -> Tensor:
 
 
 def _weighted_median(values: Float[Tensor, "e h w"], weight: Float[Tensor, "e h w"]) -> Tensor:
-    """Along the first dimension: the value with the least weighted distance from all.
+    """Median along the first dimension: the value with the least weighted distance from all.
 
     Ties are averaged, as rounding would decide them otherwise; where no weight is positive it
     means nothing.

@@ -18,7 +18,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class Died:
-    """In place of the result of a job whose process died or ran out of memory, also on its own."""
+    """The result of a job whose process died or ran out of memory, also on its own."""
 
     reason: str
 

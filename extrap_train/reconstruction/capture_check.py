@@ -32,7 +32,7 @@ from extrap_train.views import View, stack_poses
 SIDE = 960
 """Photographs are matched at this many pixels a side, at most."""
 LEAST_POINTS = 8
-"""In a third view: they are sure already."""
+"""Least points in a third view: two views already agree on them, so fewer suffice."""
 LEAST_PARALLAX_RAD = np.deg2rad(1.5)
 """Between two rays, for the point where they meet to be used."""
 MIDDLE, BORDER = 0.4, 0.7

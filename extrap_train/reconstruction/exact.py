@@ -28,7 +28,7 @@ class ExactGenerator:
 
     @property
     def warp_size(self) -> int:
-        """As large as the pictures."""
+        """Side of the warps, the same as that of the pictures."""
         return self.image_size
 
     def generate(

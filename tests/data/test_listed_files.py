@@ -66,7 +66,7 @@ def test_no_suffix_is_added_unasked(root):
         ("images/top.webp", "top.webp"),
         ("train/zzz.tif", "no folder train"),
         ("images/zzz.tif", "no images/zzz.tif"),
-        ("images", "no regular file"),
+        ("images", "not a regular file"),
     ],
 )
 def test_what_is_there_instead(root, listed, there):

@@ -115,7 +115,7 @@ def test_a_folder_of_somebody_elses_is_left_as_it_is(root):
     (root / "apple" / "0001" / "notes.txt").write_text("mine")
     before = contents(root)
     for config in (SMALL, replace(SMALL, frames=2)):
-        with pytest.raises(InputError, match=r"for it holds 0001, and is left as it is"):
+        with pytest.raises(InputError, match=r"holds 0001\) and is left as it is"):
             synthesize(config, "apple", root, LocalLauncher(1))
     assert contents(root) == before
 
@@ -124,7 +124,7 @@ def test_a_download_that_was_unpacked_over_synthetic_captures_is_left_as_it_is(r
     write_capture(root, ("106_12648_23157",), frames=1)
     shutil.copytree(root / "cup", root / "apple", dirs_exist_ok=True)
     before = contents(root)
-    with pytest.raises(InputError, match=r"for it holds sequence_annotations.jgz"):
+    with pytest.raises(InputError, match=r"holds sequence_annotations\.jgz"):
         synthesize(replace(SMALL, train_sequences=3), "apple", root, LocalLauncher(1))
     assert contents(root) == before
 

@@ -65,7 +65,7 @@ def test_a_pushed_model_is_loaded_from_a_clean_cache_and_again_without_the_hub(
         names = [_PUSHED, f"{_PUSHED}@{commit}", "me/pickles", "me/none", f"{_PUSHED}@v9"]
         newest, pinned, pickles, nobody, unknown = _ask(hub, cache, *names)
         assert [Path(newest).name, Path(pinned).name] == [later, commit]
-        assert "no model of this project" in pickles
+        assert "not a model of this project" in pickles
         assert "no such repository" in nobody
         assert "no revision v9" in unknown
         assert not any(name.endswith(".bin") for name in hub.downloads)
@@ -156,4 +156,4 @@ def test_a_push_without_a_place_or_of_no_model_is_one_line(tmp_path: Path) -> No
     said = refused_command(["task=push", "category=hydrant", "weights=base"], tmp_path)
     assert "repo=org/name" in said
     words = ["task=push", "category=hydrant", f"weights={tmp_path}", "repo=me/x"]
-    assert "no model of this project" in refused_command(words, tmp_path)
+    assert "not a model of this project" in refused_command(words, tmp_path)
