@@ -39,7 +39,8 @@ class SceneOptions:
     )
     inputs: int | None = option(
         None,
-        "input views, spread around the scene, without the one that pose names; null: all",
+        "number of input views, spread around the scene (task=complete: neighbouring, unless "
+        "complete.draw=spread), without the one that pose names; null: all",
         low=1,
         high=10_000,
     )
@@ -118,7 +119,7 @@ class CompletionConfig:
 
     draw: str = option(
         "one_sided",
-        "how the inputs are chosen: neighbours, or spread around the scene",
+        "how task=complete picks `inputs` views: neighbours, or spread around the scene",
         known=("one_sided", "spread"),
     )
     poses: str = option(
