@@ -119,7 +119,7 @@ class CompletionConfig:
 
     draw: str = option(
         "one_sided",
-        "how task=complete picks `inputs` views: neighbours, or spread around the scene",
+        "how task=complete chooses its inputs: neighbours, or spread around the scene",
         known=("one_sided", "spread"),
     )
     poses: str = option(
