@@ -4,16 +4,20 @@ import difflib
 import logging
 import os
 import posixpath
+import re
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
+
+from extrap_train.errors import InputError
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 """Tried, in this order, where a name has none."""
 _MOST_COMPARED = 2000
 """Names of a folder that a missing one is compared with."""
-_IMAGES = "images"
+_IMAGES = re.compile(r"images(_\d+)?")
+"""Folders of pictures, whole or reduced, that masks lie beside."""
 _MASK_ENDINGS = tuple(f"_mask{suffix}" for suffix in PICTURE_SUFFIXES)
 
 log = logging.getLogger(__name__)
@@ -43,11 +47,16 @@ class ListedFiles:
         ]
         if _is_file(self.root / candidates[0]):
             return candidates[0]
-        alike = [(posixpath.split(path), self._alike(path)) for path in candidates]
+        return next(self.present(candidates), None)
+
+    def present(self, paths: Iterable[str]) -> Iterator[str]:
+        """Those of the paths that are files; then those that are in another case or Unicode form,
+        where only one file is called so.
+        """
+        alike = [(posixpath.split(path), self._alike(path)) for path in paths]
         exact = [posixpath.join(*path) for path, names in alike if path[1] in names]
         other = [posixpath.join(path[0], names[0]) for path, names in alike if len(names) == 1]
-        there = (path for path in (*exact, *other) if _is_file(self.root / path))
-        return next(there, None)
+        return (path for path in (*exact, *other) if _is_file(self.root / path))
 
     def explain(self, listed: str) -> str:
         """What is there instead of a file that was not found."""
@@ -84,51 +93,66 @@ class ListedFiles:
 class MaskFiles:
     """The masks of the pictures below one folder, by the names that other tools give them.
 
-    Below `masks`, beside or in the pictures' folder, that of `images/a/1.jpg` is `a/1.jpg.png`
-    (COLMAP), `a/1.png` or another picture of that name (nerfstudio), or `a/1_mask.png`; or it is
-    `1_mask.png` beside the picture. Those of `images_2` may lie below `masks_2`.
+    Below `masks`, in the pictures' folder or beside `images`, that of `images/a/1.jpg` is
+    `images/a/1.jpg.png` or `a/1.jpg.png` (COLMAP), `1.png` or another picture of that name
+    (nerfstudio), or `1_mask.png`; or it is `1_mask.png` beside the picture. Those of `images_2` may
+    lie below `masks_2`. None of the `pictures` themselves is a mask.
     """
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, pictures: Iterable[str]) -> None:
         self._root = root.absolute()  # links stay: masks are beside the link
+        self._pictures = {self._root / picture for picture in pictures}
         self._folders: dict[Path, ListedFiles] = {}
         self._without: list[str] = []
-        self._found = 0
+        self._found: dict[Path, list[str]] = {}
 
     def find(self, picture: str) -> Path | None:
         """The mask of the picture at this path below the folder; None where there is none."""
         stem, suffix = posixpath.splitext(picture)
         first, _, rest = stem.partition("/")
         places = [(self._root / "masks", stem)]
-        if rest and first.startswith(_IMAGES):
-            places = [(self._root / _masks(first), rest), (self._root / "masks", rest), *places]
-        if self._root.name.startswith(_IMAGES):
+        if rest and _IMAGES.fullmatch(first):
+            places += [(self._root / _masks(first), rest), (self._root / "masks", rest)]
+        if _IMAGES.fullmatch(self._root.name):
             beside = self._root.parent
+            places += [(beside / "masks", f"{self._root.name}/{stem}")]
             places += [(beside / _masks(self._root.name), stem), (beside / "masks", stem)]
         endings = (f"{suffix}.png", *PICTURE_SUFFIXES, *_MASK_ENDINGS)
         tried = [(folder, name, endings) for folder, name in places if folder.is_dir()]
         for folder, name, suffixes in (*tried, (self._root, stem, _MASK_ENDINGS)):
             files = self._folders.setdefault(folder, ListedFiles(folder))
-            found = files.find(name, suffixes)
-            if found and folder / found != self._root / picture:
-                self._found += 1
-                return folder / found
+            for found in files.present([name + suffix for suffix in suffixes]):
+                mask = folder / found
+                if mask not in self._pictures:
+                    self._found.setdefault(mask, []).append(picture)
+                    return mask
         self._without.append(picture)
         return None
+
+    def require_distinct(self) -> None:
+        """InputError where one file was found as the mask of two pictures."""
+        for mask, pictures in self._found.items():
+            if len(pictures) > 1:
+                first, second = pictures[:2]
+                raise InputError(
+                    f"{mask}: its name makes it the mask of both {first} and {second}; provide "
+                    f"masks/{first}.png and masks/{second}.png instead"
+                )
 
     def warn_of_missing(self) -> None:
         """Warn where there are masks and pictures without one."""
         folders = [folder for folder in self._folders if folder != self._root]
         if not self._without or not (self._found or folders):
             return
+        found = sum(map(len, self._found.values()))
         name = posixpath.basename(self._without[0])
         stem = posixpath.splitext(name)[0]
         log.warning(
             "%s: %d of %d pictures have a mask, and the whole picture counts where there is none; "
             "that of %s would be %s.png, %s.png or %s_mask.png",
             folders[0] if folders else self._root,
-            self._found,
-            self._found + len(self._without),
+            found,
+            found + len(self._without),
             name,
             name,
             stem,
@@ -144,7 +168,7 @@ def is_mask_name(name: str, names: Iterable[str]) -> bool:
 
 
 def _masks(folder: str) -> str:
-    return folder.replace(_IMAGES, "masks", 1)
+    return folder.replace("images", "masks", 1)
 
 
 def normal_path(listed: str) -> str:

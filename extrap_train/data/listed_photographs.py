@@ -80,7 +80,7 @@ def sequence_of_photographs(
     pictures = _find_pictures(files, listed, description)
     names = _frame_names([_name_path(path, entries) for path, entries in pictures])
     frames, left_out, resized = [], [*unusable], []
-    masks = MaskFiles(files.root)
+    masks = MaskFiles(files.root, [path for path, _ in pictures])
     for (path, entries), frame_name in zip(pictures, names, strict=True):
         if not entries:
             continue
@@ -104,6 +104,7 @@ def sequence_of_photographs(
             continue
         if photo is not annotated:
             resized.append(f"{path} has {photo.height} x {photo.width} pixels (height x width)")
+    masks.require_distinct()
     if not frames:
         raise InputError(left_out[0])
     masks.warn_of_missing()

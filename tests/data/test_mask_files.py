@@ -1,6 +1,7 @@
 """Masks are found by the names that COLMAP, nerfstudio and background removers give them."""
 
 import logging
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from PIL import Image
 from posed_folders import read_json, to_bytes, write_json, write_transforms
 from test_colmap_model import Entry, write_binary
 
+from extrap_train.data.colmap import read_model
 from extrap_train.data.estimated_poses import find_pictures
 from extrap_train.data.scene_spec import open_scene
 from extrap_train.data.sequences import FrameSequence
@@ -63,7 +65,9 @@ def require_true_masks(sequence: FrameSequence) -> None:
         torch.testing.assert_close(mask, view_at(azimuth).mask, rtol=0, atol=0.5 / 255)
 
 
-@pytest.mark.parametrize("place", ["masks/left/{}.JPG.png", "masks/left/{}.png"])
+@pytest.mark.parametrize(
+    "place", ["masks/left/{}.JPG.png", "masks/left/{}.png", "masks/images/left/{}.JPG.png"]
+)
 def test_masks_of_a_colmap_model(colmap, place, caplog):
     files = write_masks(colmap, *map(place.format, AZIMUTHS))
     sequence = open_scene(str(colmap))
@@ -141,6 +145,61 @@ def test_a_folder_of_masks_that_fit_no_picture_is_said(posed, caplog):
     assert not any(frame.has_mask for frame in open_scene(str(posed)).frames)
     (record,) = caplog.records
     assert str(posed / "masks") in record.getMessage()
+
+
+def _rename_pictures(folder: Path, *names: str) -> list[Path | None]:
+    """The mask of each of a transforms folder's pictures, called so now."""
+    content = read_json(folder)
+    for frame, name in zip(content["frames"], names, strict=True):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / frame["file_path"]).rename(folder / name)
+        frame["file_path"] = name
+    write_json(folder, content)
+    frames = [frame for frame in open_scene(str(folder)).frames if frame.has_mask]
+    masks = {frame.name: frame.files[1] for frame in frames}
+    return [masks.get(Path(name).name, masks.get(name.replace("/", "_"))) for name in names]
+
+
+def test_folders_of_other_pictures_have_masks_of_their_own(posed):
+    first, other = write_masks(posed, "masks/1.png", "masks/images_right/1.png.png")
+    names = ("images/1.png", "images_right/1.png", "images_left/1.png")
+    assert _rename_pictures(posed, *names) == [first, other, None]
+
+
+def test_the_whole_path_comes_first(posed):
+    first, _ = write_masks(posed, "masks/images_2/1.png.png", "masks_2/1.png")
+    assert _rename_pictures(posed, *(f"images_2/{name}.png" for name in "123"))[0] == first
+
+
+def test_another_photograph_is_no_mask(posed):
+    names = ("images/anna.png", "images/anna_mask.png", "images/bob.png")
+    assert _rename_pictures(posed, *names) == [None, None, None]
+    (mask,) = write_masks(posed, "masks/anna_mask.png.png")
+    frames = open_scene(str(posed)).frames
+    assert [frame.files[1] for frame in frames if frame.has_mask] == [mask]
+
+
+def test_a_file_without_an_ending_is_no_mask(posed):
+    (posed / "masks").mkdir()
+    shutil.copy(posed / "images" / "000.png", posed / "masks" / "000")
+    assert not open_scene(str(posed)).frames[0].has_mask
+
+
+def test_captures_side_by_side_share_no_masks(colmap):
+    write_masks(colmap, *(f"masks/left/{azimuth}.png" for azimuth in AZIMUTHS))
+    for name, has_mask in (("images1", False), ("images2", False), ("images_2", True)):
+        shutil.copytree(colmap / "images", colmap / name)
+        frames = read_model(colmap / "sparse" / "0", colmap / name, "one").frames
+        assert {frame.has_mask for frame in frames} == {has_mask}
+
+
+def test_one_mask_of_two_pictures_is_refused(posed):
+    (mask,) = write_masks(posed, "masks/1.png")
+    said = complaint_of(
+        lambda: _rename_pictures(posed, "images/1.png", "images_2/1.png", "images/2.png")
+    )
+    for part in (mask, "images/1.png", "images_2/1.png"):
+        assert str(part) in said
 
 
 @pytest.mark.parametrize("size", [(20, 20), (HEIGHT, WIDTH), (WIDTH * 2, HEIGHT)])
