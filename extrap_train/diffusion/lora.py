@@ -121,6 +121,10 @@ def load_adapter(model: ExtrapolationModel, folder: Path) -> peft.PeftModel:
     remedy = _REMEDY.format(folder)
     record = read_adapter_record(folder)
     options = read_record(folder / _OPTIONS, _SavedOptions, remedy)
+    if options.lora_alpha != options.r:  # the tensors were trained at a scale of one
+        raise InputError(
+            f"{folder / _OPTIONS}: lora_alpha is {options.lora_alpha}, r is {options.r}; {remedy}"
+        )
     weights = _read_tensors(folder / _WEIGHTS, record.tensors, remedy)
     if base_hash(model) != record.base:
         raise InputError(

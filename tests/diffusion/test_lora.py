@@ -134,7 +134,8 @@ def test_an_adapter_whose_tensors_were_changed_is_refused(
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"r": 3}, "tensors do not fit"),
+        ({"r": 3, "lora_alpha": 3}, "tensors do not fit"),
+        ({"lora_alpha": 1000}, "lora_alpha is 1000"),
         ({"r": 0}, "r: "),
         ({"r": 10**9, "lora_alpha": 10**9}, "r: "),
         ({"lora_alpha": int("9" * 400)}, "lora_alpha: "),
