@@ -6,6 +6,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from http.client import HTTPException
 from importlib.util import find_spec
 from netrc import NetrcParseError, netrc
 from pathlib import Path
@@ -145,7 +146,7 @@ def _silence_of(address: str) -> str | None:
         urllib.request.urlopen(address, timeout=_ANSWERS_WITHIN_S).close()
     except urllib.error.HTTPError:
         return None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, HTTPException) as error:
         return f"no answer from {address}: {getattr(error, 'reason', error)}"
     return None
 

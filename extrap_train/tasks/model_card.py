@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import yaml
 from huggingface_hub import ModelCard, ModelCardData
 
 from extrap_train.config import packaged_names
@@ -87,7 +88,7 @@ def _licence_of(repository: str) -> str:
     name, _, _ = repository.partition("@")
     try:
         said = ModelCard.load(name).data.license
-    except HUB_FAILURES:
+    except (*HUB_FAILURES, ValueError, TypeError, yaml.YAMLError):  # no card, or a broken one
         said = None
     return {"apache-2.0": "Apache-2.0"}.get(
         str(said), str(said or "the licence that its page names")

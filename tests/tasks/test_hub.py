@@ -25,6 +25,7 @@ from extrap_train.diffusion.leakage import trainings_of
 from extrap_train.diffusion.model_files import initial_model, load_model, saved_config
 from extrap_train.errors import InputError
 from extrap_train.runs import run_manifest
+from extrap_train.tasks.model_card import _licence_of
 from extrap_train.tasks.scene_model import UsedWeights
 
 _PUSHED = "me/small.hydrants-v1.5"
@@ -47,6 +48,14 @@ def _ask(hub: Hub, cache: Path, *names: str) -> list[str]:
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
+
+
+def _use_hub(hub: Hub, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let this process download from a hub, into a cache of its own."""
+    template = f"{hub.address}/{{repo_id}}/resolve/{{revision}}/{{filename}}"
+    monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", hub.address)
+    monkeypatch.setattr("huggingface_hub.constants.HUGGINGFACE_CO_URL_TEMPLATE", template)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(cache))
 
 
 def test_a_pushed_model_is_loaded_from_a_clean_cache_and_again_without_the_hub(
@@ -140,6 +149,19 @@ def test_a_table_compares_a_repository(downloaded: Path) -> None:
     ).weight_files("cup")
     with pytest.raises(Unavailable, match="cannot be reached"):
         Diffusion(weights="me/{category}s").weight_files("cup")
+
+
+@pytest.mark.parametrize(
+    "card",
+    ["---\n- a\n---\n", "---\nlicense: [\n---\n", "---\n1: 2\n---\n", "---\nmodel-index: 3\n---\n"],
+)
+def test_a_start_with_a_broken_card_has_no_known_licence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, card: str
+) -> None:
+    with serve_hub() as hub:
+        _use_hub(hub, tmp_path, monkeypatch)
+        hub.add("me/start", {"README.md": card.encode()})
+        assert _licence_of("me/start") == "the licence that its page names"
 
 
 def test_paths_and_files_are_no_repositories(

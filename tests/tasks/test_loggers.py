@@ -6,6 +6,7 @@ Weights & Biases and MLflow are the real packages, without a network.
 import json
 import socket
 from pathlib import Path
+from threading import Thread
 
 import pandas as pd
 import pytest
@@ -103,6 +104,21 @@ def test_a_server_of_mlflow_that_does_not_answer_is_one_line(
         open_logger(config, opened(config)),
     ):
         pass
+
+
+def test_a_server_that_does_not_speak_http_gives_no_answer() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def answer() -> None:
+            connection, _ = server.accept()
+            with connection:
+                connection.recv(4096)
+                connection.sendall(b"what?\r\n\r\n")
+
+        Thread(target=answer, daemon=True).start()
+        said = loggers._silence_of(f"http://127.0.0.1:{server.getsockname()[1]}")
+    assert "no answer" in str(said)
+    assert "no answer" in str(loggers._silence_of("http://127.0.0.1:port"))
 
 
 def test_tensorboard_has_options_and_sheets_and_csv_adds_nothing(tmp_path: Path) -> None:
