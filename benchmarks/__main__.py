@@ -20,7 +20,7 @@ FORMATS = ("csv", "md", "latex", "html")
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status."""
-    options = _parsed(arguments)
+    options = _parse_arguments(arguments)
     try:
         with ends_in_one_line():
             return _run_command(options)
@@ -38,7 +38,7 @@ def _run_command(options: argparse.Namespace) -> int:
     return status
 
 
-def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
+def _parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Overrides may stand before, between and after the options."""
     parser = _parser()
     options, rest = parser.parse_known_args(arguments)

@@ -57,7 +57,7 @@ class Catalogue:
 
     def method(self, name: str, options: Mapping[str, Any] | None = None) -> MethodConfig:
         """A method by name, with options that replace those of its file."""
-        method = MethodConfig(**self._typed("method", name, MethodConfig, {"name": name}))
+        method = MethodConfig(**self._read_typed("method", name, MethodConfig, {"name": name}))
         method.options |= options or {}
         return method
 
@@ -65,11 +65,13 @@ class Catalogue:
         """A metric of your own by name."""
         if name in METRICS:
             raise InputError(f"scoring.metrics: {name} is the package's; give yours another name")
-        metric = MetricConfig(**self._typed("metric", name, MetricConfig, {}))
+        metric = MetricConfig(**self._read_typed("metric", name, MetricConfig, {}))
         check_options(metric, f"metric {name}: ")
         return metric
 
-    def _typed(self, kind: str, name: str, schema: type, more: Mapping[str, Any]) -> dict[str, Any]:
+    def _read_typed(
+        self, kind: str, name: str, schema: type, more: Mapping[str, Any]
+    ) -> dict[str, Any]:
         """A YAML's values, of the types that a dataclass declares."""
         content = self.content(kind, name)
         try:

@@ -77,12 +77,12 @@ def run_table(table: TableConfig, catalogue: Catalogue, options: RunOptions) -> 
     Raises InputError where another run holds the folder, or where the table cannot be made.
     """
     folder = TableFolder(Path(table.output) / table.name)
-    with _locked(folder):
+    with _lock_folder(folder):
         return _run(table, catalogue, options, folder, terminal())
 
 
 @contextmanager
-def _locked(folder: TableFolder) -> Iterator[None]:
+def _lock_folder(folder: TableFolder) -> Iterator[None]:
     """The folder for this process alone, without what killed runs have left in it."""
     taken = f"{folder.path}: another process runs this table; wait for it or give output=FOLDER"
     with ExitStack() as held:

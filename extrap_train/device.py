@@ -97,7 +97,7 @@ def advise_on_adapting_memory(lora: LoraConfig, trainer: TrainerConfig) -> Advic
 
 
 def advise_on_sampling_memory(at_once: int, trainer: TrainerConfig) -> Advice:
-    """For sampling so many views at once."""
+    """Advice for a GPU that ran out of memory while `at_once` views were sampled."""
     remedies = [
         (at_once > 1, f"sample_batch_size={max(1, at_once // 2)}"),
         (torch.cuda.is_available() and trainer.accelerator != "cpu", "trainer.accelerator=cpu"),

@@ -83,10 +83,10 @@ def draw_contact_sheet(
     if captions:
         said = zip(range(rows), captions, strict=True)
         texts |= {(4, strip + row * pitch + 1): " ".join(text.split()) for row, text in said}
-    write_atomic(path, _written_on(sheet, texts))
+    write_atomic(path, _draw_texts(sheet, texts))
 
 
-def _written_on(sheet: np.ndarray, texts: dict[tuple[int, int], str]) -> bytes:
+def _draw_texts(sheet: np.ndarray, texts: dict[tuple[int, int], str]) -> bytes:
     """The sheet as PNG, with texts drawn on it at their upper left corners (x, y)."""
     picture = Image.fromarray(sheet)
     draw = ImageDraw.Draw(picture)
@@ -149,7 +149,7 @@ def write_film(images: Float[Tensor, "n 3 h w"], path: Path) -> None:
 
     The MP4 holds VP9, which browsers and players read; a GIF repeats for ever.
     """
-    frames = _enlarged(to_eight_bits(images).transpose(0, 2, 3, 1))
+    frames = _enlarge(to_eight_bits(images).transpose(0, 2, 3, 1))
     # A folder: the writers go by the file's suffix.
     temporary = partial_path(path)
     try:
@@ -169,7 +169,7 @@ def write_film(images: Float[Tensor, "n 3 h w"], path: Path) -> None:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _enlarged(pixels: np.ndarray) -> np.ndarray:
+def _enlarge(pixels: np.ndarray) -> np.ndarray:
     """Enlarged by a whole number to at least a tile's size, with even sides, as video needs."""
     scale = max(1, round(_LEAST_TILE_PIXELS / pixels.shape[2]))
     large = pixels.repeat(scale, 1).repeat(scale, 2)

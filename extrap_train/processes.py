@@ -70,7 +70,7 @@ def join(folder: Path, wait_s: float = _WAIT_S) -> Opening:
     return opening
 
 
-def gathered(value: T) -> list[T]:
+def gather_values(value: T) -> list[T]:
     """Every process's value, in the order of their ranks; tensors must be on the CPU."""
     if not (dist.is_available() and dist.is_initialized()):
         return [value]

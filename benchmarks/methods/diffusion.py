@@ -84,7 +84,7 @@ class Diffusion:
         The time is a single image's share of all that the scene takes, compiling and loading aside.
         """
         folder = self._folder(inputs.category)
-        model = _loaded(folder)
+        model = _load_cached(folder)
         if model.config.family != self.family:
             raise InputError(
                 f"{folder}: is a model of the family {model.config.family}, not {self.family}; "
@@ -100,7 +100,7 @@ class Diffusion:
             given["made at"] = f"{made.images.shape[-1]} px"
         return replace(
             made,
-            images=_resampled(made.images, size),
+            images=_resample(made.images, size),
             seconds=watch.seconds / len(made.images),
             given=given | dict(made.given),
         )
@@ -155,13 +155,13 @@ def target_names(inputs: SceneInputs) -> list[str]:
 
 
 @lru_cache(2)
-def _loaded(folder: Path) -> ExtrapolationModel:
+def _load_cached(folder: Path) -> ExtrapolationModel:
     """A worker makes one cell after another, mostly with the same model."""
     model = load_model(folder).eval().requires_grad_(False)
     return model.to("cuda") if torch.cuda.is_available() else model
 
 
-def _resampled(
+def _resample(
     images: Float[Tensor, "n 3 h w"], size: tuple[int, int]
 ) -> Float[Tensor, "n 3 h2 w2"]:
     """At the table's size: a small model generates small pictures."""

@@ -82,11 +82,11 @@ class DnGaussianRecipe(Recipe):
         super().adapt(training)
         every = self.options.clear_every
         if training.schedule.due(training.iteration, 0, every, MIN_BETWEEN_GROWTH):
-            unwanted = self._misplaced(training.optimiser.parameters)
+            unwanted = self._find_misplaced(training.optimiser.parameters)
             remove(training.optimiser, training.statistics, unwanted)
 
     @torch.no_grad()
-    def _misplaced(self, parameters: GaussianParameters) -> Bool[Tensor, " n"]:
+    def _find_misplaced(self, parameters: GaussianParameters) -> Bool[Tensor, " n"]:
         before = torch.zeros_like(parameters.opacity_logits, dtype=torch.bool)
         seen = before.clone()
         for camera, nearest in zip(self.cameras, self._nearest_expected, strict=True):

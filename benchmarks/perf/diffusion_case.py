@@ -39,8 +39,8 @@ def compare_models(
 ) -> list[Row]:
     """One row per batch size, on a GPU with torch.compile as well.
 
-    Prints the speed and memory of both, each of which costs as much as so many forward `passes` an
-    image. `reference` is built with the plain copy of the model.
+    Prints the speed and memory of both, each of which costs `passes` forward passes an image.
+    `reference` is built with the plain copy of the model.
     """
     rows = []
     name, width, counts = _MODELS[device.type]

@@ -65,11 +65,11 @@ def _is_usual(file: Path) -> bool:
 
 def pictures_of(pictures: Mapping[Path, bytes], side: int) -> Float[Tensor, "n 3 side side"]:
     """The pictures in files of `png_bytes`, colours in [0, 1]; InputError for any others."""
-    pixels = [_decoded(content, side, file) for file, content in pictures.items()]
+    pixels = [_decode(content, side, file) for file, content in pictures.items()]
     return torch.from_numpy(np.stack(pixels)).permute(0, 3, 1, 2).float() / 255
 
 
-def _decoded(content: bytes, side: int, file: Path) -> UInt8[np.ndarray, "side side 3"]:
+def _decode(content: bytes, side: int, file: Path) -> UInt8[np.ndarray, "side side 3"]:
     try:
         with Image.open(io.BytesIO(content), formats=("PNG",)) as picture:
             if (picture.size, picture.mode) != ((side, side), "RGB"):

@@ -114,7 +114,9 @@ class Results:
         rows: list[dict[str, Any]] = []
         for (draw, n_views, metric), part in table.groupby(["draw", "n_views", "metric"]):
             head = {"draw": draw, "n_views": n_views, "metric": metric}
-            rows += _ranked(part, head, metric_direction(str(metric), self.plan.table.scoring.own))
+            rows += _rank_means(
+                part, head, metric_direction(str(metric), self.plan.table.scoring.own)
+            )
         return pd.DataFrame(rows, columns=MEANS)
 
 
@@ -130,7 +132,7 @@ def read_results(folder: TableFolder) -> Results:
     return Results(folder, plan, planned_cells(folder.cells, plan))
 
 
-def _ranked(part: pd.DataFrame, head: dict[str, Any], sign: int) -> list[dict[str, Any]]:
+def _rank_means(part: pd.DataFrame, head: dict[str, Any], sign: int) -> list[dict[str, Any]]:
     """Means of one column, with ranks and paired differences to the best.
 
     `sign` is 1 where higher is better, -1 where lower is, 0 for no ranks.

@@ -140,11 +140,11 @@ def _scene(results: Results, name: str, cells: list[Cell]) -> dict[str, Any]:
     truth = scene.truth()
     return {
         "name": name,
-        "inputs": [_embedded(view.image) for view in scene.inputs().views],
+        "inputs": [_embed_picture(view.image) for view in scene.inputs().views],
         "targets": list(scene.draw.targets),
         "angles": [round(math.degrees(angle)) for angle in scene.record.angles_rad],
-        "truth": [_embedded(image) for image in truth.images],
-        "warp": [_embedded(image) for image in truth.warps],
+        "truth": [_embed_picture(image) for image in truth.images],
+        "warp": [_embed_picture(image) for image in truth.warps],
         "methods": [_method(results, cell, scene, truth.images) for cell in cells],
     }
 
@@ -164,8 +164,8 @@ def _method(
     return {
         "title": title,
         "status": OK,
-        "images": [_embedded(image) for image in images],
-        "errors": [_embedded(image) for image in error_map(images, truth)],
+        "images": [_embed_picture(image) for image in images],
+        "errors": [_embed_picture(image) for image in error_map(images, truth)],
         "scores": {
             name_of(m): cell.metrics[m].per_image
             for m in shown
@@ -174,7 +174,7 @@ def _method(
     }
 
 
-def _embedded(image: Float[Tensor, "3 h w"]) -> str:
+def _embed_picture(image: Float[Tensor, "3 h w"]) -> str:
     picture = Image.fromarray(to_eight_bits(image.permute(1, 2, 0)))
     content = io.BytesIO()
     kind = "jpeg" if picture.width >= _LARGE_PIXELS else "png"

@@ -127,7 +127,7 @@ def lay_out(results: Results, reported: dict[str, Any] | None) -> Layout:
     return Layout(
         title=name + quick,
         panels=panels,
-        reported=None if reported is None else _reported(reported),
+        reported=None if reported is None else _list_reported(reported),
         missing=[one_line(line, _MAX_NOTE) for line in _missing(results)],
         notes=[one_line(line, _MAX_NOTE) for line in _notes(results)],
     )
@@ -187,7 +187,7 @@ def _number(value: float, metric: str) -> str:
     return f"{value:.{digits}f}"
 
 
-def _reported(content: dict[str, Any]) -> Panel:
+def _list_reported(content: dict[str, Any]) -> Panel:
     """Published numbers, labelled as such and never ranked with ours."""
     views = sorted({n for row in content["rows"].values() for n in row})
     columns = [(metric, n) for metric in content["metrics"] for n in views]
@@ -259,13 +259,13 @@ def input_notes(results: Results) -> list[str]:
             for name, value in cell.given.items():
                 used.setdefault(cell.method, {}).setdefault(name, Counter())[value] += 1
     lines = [
-        f"{method} — {', '.join(f'{name}: {_counted(values)}' for name, values in words.items())}"
+        f"{method} — {', '.join(f'{name}: {_count_values(n)}' for name, n in words.items())}"
         for method, words in used.items()
     ]
     return ["Inputs: " + "; ".join(lines) + "."] if lines else []
 
 
-def _counted(values: Counter[str]) -> str:
+def _count_values(values: Counter[str]) -> str:
     """With the number of cells where they are not all alike; words that differ in their numbers
     only are said once, with the numbers' ranges.
     """

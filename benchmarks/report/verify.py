@@ -128,7 +128,7 @@ def _report_problems(results: Results) -> Iterator[str]:
 
 
 def _identity_problems(results: Results, cell: Cell, scene: Scene) -> Iterator[str]:
-    """What a cell says of itself, and its name, its row, its draw or its photographs do not."""
+    """Differences between a cell's record and its name, its row, its draw or its photographs."""
     if cell_key(cell.made_from, cell.scored_from) != cell.key:
         yield "its name does not follow from what it states that it was made from"
     options = image_options(results.methods[cell.method], results.plan.table.rules, cell.device)

@@ -62,7 +62,7 @@ def run_method(job: CellJob) -> bytes:
         return _pack({"status": UNAVAILABLE, "reason": one_line(str(error))})
     except BaseException as error:  # SystemExit and KeyboardInterrupt are its own, too
         reason = one_line(f"{type(error).__name__}: {error}")
-        trace = _shortened(traceback.format_exc())
+        trace = _shorten(traceback.format_exc())
         return _pack({"status": FAILED, "reason": reason, "traceback": trace})
 
 
@@ -196,12 +196,12 @@ def _parse(content: bytes) -> MethodOutput:
     return replace(
         output,
         reason=one_line(output.reason),
-        traceback=_shortened(output.traceback),
+        traceback=_shorten(output.traceback),
         given={one_line(key): one_line(value) for key, value in output.given.items()},
         counts={one_line(key): value for key, value in output.counts.items()},
     )
 
 
-def _shortened(text: str) -> str:
+def _shorten(text: str) -> str:
     lines = text.splitlines()[-_MAX_TRACEBACK_LINES:]
     return "\n".join(" " * (len(one) - len(one.lstrip())) + one_line(one) for one in lines)

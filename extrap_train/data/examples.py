@@ -70,16 +70,16 @@ def _mirror_camera(camera: Camera) -> Camera:
 
 def collate(examples: Sequence[Example], references: int) -> PairBatch:
     """A batch with room for `references`; missing ones are the first again, marked invalid."""
-    return PairBatch(**_stacked(examples, references))
+    return PairBatch(**_stack(examples, references))
 
 
 def pack(examples: Sequence[Example], references: int) -> PackedBatch:
     """`collate` for examples as they are stored."""
     units = torch.tensor([example.depth_unit for example in examples])
-    return PackedBatch(**_stacked(examples, references), depth_unit=units)
+    return PackedBatch(**_stack(examples, references), depth_unit=units)
 
 
-def _stacked(examples: Sequence[Example], references: int) -> dict[str, Any]:
+def _stack(examples: Sequence[Example], references: int) -> dict[str, Any]:
     orders = [
         [i if i < len(e.reference_images) else 0 for i in range(references)] for e in examples
     ]
@@ -88,17 +88,17 @@ def _stacked(examples: Sequence[Example], references: int) -> dict[str, Any]:
     return {
         "image": torch.stack([e.image for e in examples]),
         "camera": stack_cameras([e.camera for e in examples]),
-        "reference_images": _gathered([e.reference_images for e in examples], orders),
+        "reference_images": _gather([e.reference_images for e in examples], orders),
         "reference_cameras": stack_cameras(
             [e.reference_cameras[torch.tensor(o)] for e, o in pairs]
         ),
-        "reference_depths": _gathered([e.reference_depths for e in examples], orders),
+        "reference_depths": _gather([e.reference_depths for e in examples], orders),
         "reference_valid": torch.tensor(valid),
         "reference_flows": _flows([(e.reference_flows, o) for e, o in pairs]),
     }
 
 
-def _gathered(
+def _gather(
     parts: Sequence[Shaped[Tensor, "_ *c h w"]], orders: Sequence[Sequence[int]]
 ) -> Shaped[Tensor, "b k *c h w"]:
     """The chosen pictures of every example, each copied once."""

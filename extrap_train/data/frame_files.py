@@ -84,11 +84,11 @@ class StoredFrames:
 
     def image(self, index: int) -> UInt8[Tensor, "3 h w"]:
         """The photograph's bytes of colour."""
-        return torch.from_numpy(self._decoded(index, 0, decode_image))
+        return torch.from_numpy(self._decode(index, 0, decode_image))
 
     def depth(self, index: int) -> Float16[Tensor, "h w"]:
         """The depth map in the sequence's unit; 0 is unknown."""
-        return torch.from_numpy(self._decoded(index, 1, decode_depth))
+        return torch.from_numpy(self._decode(index, 1, decode_depth))
 
     def view(self, index: int) -> View:
         """A frame with its depth in scene units; 0 is unknown."""
@@ -96,7 +96,7 @@ class StoredFrames:
         depth = self.depth(index).float().mul_(self.depth_scale)
         return View(image, self.camera[index], depth)
 
-    def _decoded(
+    def _decode(
         self, index: int, part: int, decode: Callable[[np.ndarray, int], np.ndarray]
     ) -> np.ndarray:
         content = np.asarray(self._content[self._starts[index, part] : self._ends[index, part]])

@@ -36,9 +36,9 @@ def read_json(path: Path) -> Any:
 
 
 def read_json_list(path: Path, what: str) -> Iterator[Any]:
-    """The entries of a JSON file that is one list, `what` of which is said where it is none.
+    """The entries of a JSON file that is one list; `what` names them if it is not.
 
-    Of the file, no more than an entry and a piece are in memory at a time. Raises InputError as
+    No more than an entry and a piece of the file are in memory at a time. Raises InputError as
     `read_json` does, once everything before the fault has been given.
     """
     text = _Text(path)

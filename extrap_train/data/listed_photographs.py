@@ -69,10 +69,9 @@ def sequence_of_photographs(
     """A sequence of the photographs below `files.root`, in the order of their paths.
 
     `description` is the file that lists them; masks that it does not name are found by `MaskFiles`.
-    `unusable` says of more of its entries why they name
-    no picture. Entries without a picture, and those that cannot be used or contradict each other,
-    are left out with one warning each kind. Raises InputError where none is left, or the cameras
-    can see nothing in common.
+    `unusable` holds the reasons why further entries name no picture. Entries without a picture, and
+    those that cannot be used or contradict each other, are left out with one warning each kind.
+    Raises InputError where none is left, or the cameras can see nothing in common.
     """
     count = len(listed) + len(unusable)
     if count > MAX_FRAMES:

@@ -88,7 +88,7 @@ def main() -> None:
     output.mkdir()
     models = pycolmap.incremental_mapping(database, folder, output, options)
     if models:
-        model = _refined(max(models.values(), key=lambda found: found.num_reg_images()), threads)
+        model = _refine(max(models.values(), key=lambda found: found.num_reg_images()), threads)
         _restore_photographs(model, cameras)
         model.normalize(extent=1.0)
         (output / "0").mkdir(exist_ok=True)
@@ -139,7 +139,7 @@ def _match(database: Path, folder: Path, files: Sequence[str], threads: int) -> 
         print(len(pairs), flush=True)
 
 
-def _refined(model: "pycolmap.Reconstruction", threads: int) -> "pycolmap.Reconstruction":
+def _refine(model: "pycolmap.Reconstruction", threads: int) -> "pycolmap.Reconstruction":
     """All cameras and points adjusted once more, with less weight for outliers than the mapper.
 
     Lenses start without distortion and with the principal point in the middle.

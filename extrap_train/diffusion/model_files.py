@@ -248,7 +248,7 @@ def initial_model(config: ModelConfig) -> ExtrapolationModel:
                 f"{SOURCES}"
             )
         return ExtrapolationModel(config)
-    return _filled(config.start, config, "model.start", to_train=True)
+    return _fill(config.start, config, "model.start", to_train=True)
 
 
 def published_model(weights: str, config: ModelConfig) -> ExtrapolationModel:
@@ -256,12 +256,10 @@ def published_model(weights: str, config: ModelConfig) -> ExtrapolationModel:
 
     Raises InputError for weights of another family: they are a start, and no model.
     """
-    return _filled(weights, config, "weights", to_train=False)
+    return _fill(weights, config, "weights", to_train=False)
 
 
-def _filled(
-    weights: str, config: ModelConfig, option: str, *, to_train: bool
-) -> ExtrapolationModel:
+def _fill(weights: str, config: ModelConfig, option: str, *, to_train: bool) -> ExtrapolationModel:
     with torch.device("meta"):
         model = ExtrapolationModel(config)
     given = packaged_weights(weights) if weights in packaged_names() else Path(weights)

@@ -58,7 +58,7 @@ def compress(state: Mapping[str, Tensor], base: Mapping[str, Tensor]) -> dict[st
             continue
         difference = value.detach().float().cpu() - base[name].float().cpu()
         packed, tensors[name + _SCALE] = quantised(difference.flatten(1))
-        tensors[name + _BITS] = _deflated(packed)
+        tensors[name + _BITS] = _deflate(packed)
     return tensors
 
 
@@ -77,7 +77,7 @@ def restore(
         shape = base[name].shape
         if len(shape) < 2:
             raise ValueError(f"{name}: is never kept as a difference")
-        packed = _inflated(name, tensors[name + _BITS], shape)
+        packed = _inflate(name, tensors[name + _BITS], shape)
         step = tensors.get(name + _SCALE)
         if step is None or step.shape != shape[:1] or not step.is_floating_point():
             raise ValueError(f"{name}: has no scale a channel")
@@ -95,9 +95,9 @@ def quantised(
     """
     steps = rows.abs().amax(1) / _LEVELS * _CLIPS[:, None].to(rows)  # clips × rows
     steps = steps.half().float()  # as they are stored
-    errors = torch.stack([(_rounded(rows, s) * s[:, None] - rows).square().sum(1) for s in steps])
+    errors = torch.stack([(_round(rows, s) * s[:, None] - rows).square().sum(1) for s in steps])
     step = steps.gather(0, errors.argmin(0)[None])[0]
-    codes = (_rounded(rows, step) + _LEVELS).to(torch.uint8)
+    codes = (_round(rows, step) + _LEVELS).to(torch.uint8)
     if codes.shape[1] % 2:
         codes = torch.cat([codes, codes.new_zeros(len(codes), 1)], 1)
     return (codes[:, ::2] | codes[:, 1::2] << 4).contiguous(), step.half()
@@ -111,18 +111,18 @@ def dequantised(
     return (codes.float() - _LEVELS) * step.float()[:, None]
 
 
-def _rounded(rows: Float[Tensor, "o n"], step: Float[Tensor, " o"]) -> Float[Tensor, "o n"]:
+def _round(rows: Float[Tensor, "o n"], step: Float[Tensor, " o"]) -> Float[Tensor, "o n"]:
     return (rows / step.clamp_min(1e-12)[:, None]).round().clamp(-_LEVELS, _LEVELS)
 
 
-def _deflated(packed: UInt8[Tensor, "o m"]) -> UInt8[Tensor, " c"]:
+def _deflate(packed: UInt8[Tensor, "o m"]) -> UInt8[Tensor, " c"]:
     """Codes near zero are the most frequent: Huffman's code saves a seventh."""
     return torch.frombuffer(
         bytearray(zlib.compress(packed.numpy().tobytes(), 9)), dtype=torch.uint8
     )
 
 
-def _inflated(name: str, bits: Shaped[Tensor, "..."], shape: torch.Size) -> UInt8[Tensor, "o m"]:
+def _inflate(name: str, bits: Shaped[Tensor, "..."], shape: torch.Size) -> UInt8[Tensor, "o m"]:
     """Two values a byte for a tensor of this shape; never more memory than that, whatever `bits`
     claims to hold.
     """

@@ -26,7 +26,7 @@ from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError
 from extrap_train.metrics import Distance
-from extrap_train.processes import gathered
+from extrap_train.processes import gather_values
 from extrap_train.views import PairBatch
 
 _STEPS_A_ROW = 20
@@ -91,11 +91,13 @@ class CategoryTraining(lightning.LightningModule):
         self.validated_step = self.global_step
         self.validation_seconds = time.perf_counter() - self._validation_started
         own = {index: score(made, self.distance) for index, made in self.predictions.items()}
-        self.tables = {index: table for tables in gathered(own) for index, table in tables.items()}
+        self.tables = {
+            index: table for tables in gather_values(own) for index, table in tables.items()
+        }
         names = [name for batch in self.validation_names for name in batch]
         shown = [names[i] for i in linspace_indices(len(names), self.config.validation.pictures)]
         self._shown = views_named(
-            gathered(views_named(list(self.predictions.values()), shown)), shown
+            gather_values(views_named(list(self.predictions.values()), shown)), shown
         )
         summary = summarise(self.scores())
         metrics = {f"validation/{name}": value for name, value in summary["model"].items()}

@@ -14,7 +14,7 @@ from extrap_train.gaussians.projection_numba import MIN_ALPHA
 from extrap_train.geometry.compiled import compiled
 
 CHANNELS = 4
-"""Features are blended so many at a time."""
+"""Features that are blended at a time."""
 MOMENTS = 6 + CHANNELS
 """What a slot holds: Σg, Σg·dy, Σg·dy², Σg·e, Σg·e·dy, Σg·e², with g the gradient to log alpha, dy
 the distance from the mean along y and e that from the centre line along x; then one sum a feature.

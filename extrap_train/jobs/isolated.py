@@ -162,10 +162,10 @@ class _Sink:
         self._descriptor = descriptor
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _received, (reduction.DupFd(self._descriptor),)
+        return _receive, (reduction.DupFd(self._descriptor),)
 
 
-def _received(duplicate: Any) -> int:
+def _receive(duplicate: Any) -> int:
     descriptor: int = duplicate.detach()
     return descriptor
 

@@ -34,13 +34,13 @@ SIDE = 960
 LEAST_POINTS = 8
 """Least points in a third view: two views already agree on them, so fewer suffice."""
 LEAST_PARALLAX_RAD = np.deg2rad(1.5)
-"""Between two rays, for the point where they meet to be used."""
+"""Least angle between two rays for the point where they meet to be used."""
 MIDDLE, BORDER = 0.4, 0.7
 """Radii as shares of half the diagonal: a lens is checked within the first against beyond the
 second."""
 LENS_PIXELS, LENS_RATIO = 0.5, 3.0
-"""A border whose matches lie so far off, and so many times farther than the middle's, is bent: most
-of a distortion runs along the epipolar lines of an orbit and does not show."""
+"""A border is bent if its matches lie this far off, and this many times farther than the middle's:
+most of a distortion runs along the epipolar lines of an orbit and does not show."""
 DEPTH_RATIO = 1.25
 MASK_DISAGREEMENT = 0.3
 """Share of the matched points in either view's mask that may be missing from the other's."""

@@ -35,7 +35,7 @@ def draw_check(check: CaptureCheck, path: Path) -> None:
     _draw_cameras(figure.add_subplot(grid[0, 3]), figure.add_subplot(grid[1, 3]), check)
     _draw_distances(figure.add_subplot(grid[2, 3]), check)
     said = check.problems[:PROBLEMS] or ["nothing looks wrong"]
-    figure.suptitle("\n".join(map(_shortened, said)), fontsize=11)
+    figure.suptitle("\n".join(map(_shorten, said)), fontsize=11)
     save_figure(figure, path, dpi=80)
 
 
@@ -80,7 +80,7 @@ def _pixels(value: float) -> str:
     return f"{value:.2f} px" if np.isfinite(value) else "too few to say how far"
 
 
-def _shortened(text: str) -> str:
+def _shorten(text: str) -> str:
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}…"
 
 

@@ -59,7 +59,7 @@ def _points_of(known: GlobalMap, index: int, votes: bool, subdivide: int) -> Poi
     confidence = view.confidence
     sound = on_surface  # a few surfaces have no normal
     if votes:
-        confidence, share = _voted(known, index, points.flatten(0, 1))
+        confidence, share = _count_votes(known, index, points.flatten(0, 1))
         confidence, share = confidence.view_as(sound), share.view_as(sound)
         sound = sound & (share >= 0.5)
         confidence = confidence * share
@@ -67,7 +67,7 @@ def _points_of(known: GlobalMap, index: int, votes: bool, subdivide: int) -> Poi
     values = torch.cat(
         [points, view.view.image.permute(1, 2, 0), normals @ rotation.mT, confidence[..., None]], -1
     )
-    rows = _subdivided(values, view.fresh & sound, sound, view, subdivide)
+    rows = _subdivide(values, view.fresh & sound, sound, view, subdivide)
     return PointCloud(
         points=rows[:, :3],
         colors=rows[:, 3:6].clamp(0, 1),
@@ -77,7 +77,7 @@ def _points_of(known: GlobalMap, index: int, votes: bool, subdivide: int) -> Poi
     )
 
 
-def _voted(
+def _count_votes(
     known: GlobalMap, index: int, points: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
     """Confidence of the most certain view of each point; share of the votes that confirm it."""
@@ -95,7 +95,7 @@ def _voted(
     return surest, confirmed / (confirmed + contradicted).clamp(min=1e-6)
 
 
-def _subdivided(
+def _subdivide(
     values: Float[Tensor, "h w c"],
     kept: Bool[Tensor, "h w"],
     sound: Bool[Tensor, "h w"],

@@ -42,14 +42,16 @@ def draw_growth(known: GlobalMap, cloud: PointCloud, path: Path) -> None:
     for count in stages:
         title = f"{given} inputs" if count == given else f"+ {count - given} views"
         then = cloud[cloud.view < count]
-        columns[title] = torch.cat([_drawn(_near(then, close), close), _drawn(then, far)])
+        columns[title] = torch.cat(
+            [_draw_cloud(_select_near(then, close), close), _draw_cloud(then, far)]
+        )
     draw_contact_sheet(columns, path)
 
 
 def draw_turntable(known: GlobalMap, cloud: PointCloud, path: Path) -> None:
     """A film around the whole cloud."""
     cameras = _turn(known, TURN_FRAMES)
-    write_film(_drawn(_near(cloud, cameras), cameras), path)
+    write_film(_draw_cloud(_select_near(cloud, cameras), cameras), path)
 
 
 def framed(cameras: Camera, cloud: PointCloud) -> Camera:
@@ -105,13 +107,13 @@ def _turn(known: GlobalMap, count: int) -> Camera:
     return circle_cameras(given, middle, count).resized(PICTURE_SIZE, PICTURE_SIZE)
 
 
-def _near(cloud: PointCloud, cameras: Camera) -> PointCloud:
+def _select_near(cloud: PointCloud, cameras: Camera) -> PointCloud:
     center = torch.from_numpy(scene_center(cameras)).to(cloud.points)
     distance = (cameras.center - center).norm(dim=-1).mean()
     return cloud[(cloud.points - center).norm(dim=-1) < REACH * distance]
 
 
-def _drawn(cloud: PointCloud, cameras: Camera) -> Float[Tensor, "n 3 h w"]:
+def _draw_cloud(cloud: PointCloud, cameras: Camera) -> Float[Tensor, "n 3 h w"]:
     """The cloud as each camera sees it, on white."""
     pictures = []
     for index in range(len(cameras.world_to_cam)):

@@ -77,7 +77,7 @@ def confirmed(
 
 
 def supported(measured: Measured, prior: Prior, possible_edges: int, tolerance: float) -> Measured:
-    """The confidence times what bears it out, 1 at best; which pixels are reliable stays.
+    """The confidence times what confirms it, 1 at best; which pixels are reliable stays.
 
     For the whole view that is the share of its reliable pixels that the map could test and
     confirms: what is wrong where it can be tested is likely to be wrong elsewhere, and of a view of

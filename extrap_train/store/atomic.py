@@ -130,7 +130,7 @@ def install_folder(made: Path, folder: Path, is_wanted: Callable[[Path], bool]) 
     """Let what was `made` become `folder`, on the same file system, once it is on the disk.
 
     What lay there is replaced, unless it is what is wanted: then another writer has come first, and
-    its folder stays, so that nobody who reads it by now is disturbed. Whenever this process is
+    its folder stays, so that no reader is disturbed. Whenever this process is
     killed, the folder is there whole, as it was or as it is now, or not at all.
     """
     for path in (*made.rglob("*"), made):

@@ -28,12 +28,12 @@ def file_digest(path: Path) -> str:
     try:
         stamp = _stamp(path)
         if stamp[0] < _LARGE_BYTES:
-            return _hashed(path)
+            return _hash_file(path)
         name = hashlib.sha256(f"{path.resolve()}\0{stamp}".encode(errors="surrogateescape"))
         record = cache_folder("digests") / name.hexdigest()
         if (known := _read_known(record)) is not None:
             return known
-        digest = _hashed(path)
+        digest = _hash_file(path)
         settled = time.time_ns() - max(stamp[1:3]) > _SETTLED_NS
         if settled and _stamp(path) == stamp:
             with suppress(InputError):  # a full or read-only home costs only time
@@ -75,7 +75,7 @@ def weights_digest(weights: Path) -> str:
     return folder_digest(weights) if weights.is_dir() else file_digest(weights)
 
 
-def _hashed(path: Path) -> str:
+def _hash_file(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

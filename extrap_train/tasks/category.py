@@ -75,7 +75,7 @@ def run(config: TrainConfig, prepare: Prepare) -> Outcome:
     seconds = {"prepare": time.perf_counter() - started}
     manifest = run_manifest(config, prepared)
     require_unseen(config.model.start, manifest)
-    with _opened(folder, config, manifest, console) as opening:
+    with _open_run(folder, config, manifest, console) as opening:
         if opening.is_finished:
             steps = Finished.read(folder).steps
             console.print(f"already trained for {steps} steps: {folder.path}")
@@ -95,7 +95,7 @@ def run(config: TrainConfig, prepare: Prepare) -> Outcome:
 
 
 @contextmanager
-def _opened(
+def _open_run(
     folder: RunFolder, config: TrainConfig, manifest: Manifest, console: Console
 ) -> Iterator[Opening]:
     """The run, closed to other commands; the first process opens it, the others follow."""

@@ -51,7 +51,7 @@ def write_fitted_splats(
     seconds = time.perf_counter() - started if fresh else 0.0
     splats = read_splats(path)
     truth = torch.stack([view.image for view in views])
-    drawn = quantised(_drawn(_inside(splats, world), known, gaussian_options))
+    drawn = quantised(_draw_views(_inside(splats, world), known, gaussian_options))
     draw_contact_sheet(
         {"view": truth, "splats": drawn, "error": error_map(drawn, truth)}, folder / "splats.png"
     )
@@ -90,7 +90,7 @@ def _inside(splats: Gaussians, world: WorldFrame) -> Gaussians:
 
 
 @torch.no_grad()
-def _drawn(
+def _draw_views(
     splats: Gaussians, known: GlobalMap, options: GaussianOptions
 ) -> Float[Tensor, "n 3 h w"]:
     rasterize, behind = rasterizer(options.rasterizer), BACKGROUNDS[options.background]

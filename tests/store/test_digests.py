@@ -30,7 +30,7 @@ def test_a_known_file_is_not_read_again(
     file = tmp_path / "weights"
     file.write_bytes(b"one")
     assert file_digest(file) == _sha(b"one")
-    monkeypatch.setattr(digests, "_hashed", lambda _: pytest.fail("was read again"))
+    monkeypatch.setattr(digests, "_hash_file", lambda _: pytest.fail("was read again"))
     assert file_digest(file) == _sha(b"one")
 
 
