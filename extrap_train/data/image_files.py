@@ -36,6 +36,8 @@ DECODER_ERRORS = (
 """What Pillow's decoders raise on damaged files."""
 BACKGROUND = 255
 """What a photograph shows where it is transparent: white, whatever colour is hidden there."""
+_LEAST_PURE = 0.9
+"""Of what a transparent picture shows, the share in pure black or white that makes it a mask."""
 _EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr")
 _ORIENTATION_TAG, _EXIF_TAG, _FOCAL_LENGTH_35MM_TAG = 0x0112, 0x8769, 0xA405
 _QUARTER_TURNS = (5, 6, 7, 8)
@@ -89,14 +91,19 @@ def read_photograph(
 def read_mask(path: Path, size: tuple[int, int]) -> Float[Tensor, "h w"]:
     """An object mask in [0, 1]: white is the object, or of a cut-out what is not transparent.
 
-    A mask of the same shape as `size` is resampled to it. One of 0 and 1 alone means black and
-    white. One without any object is an error, one that is all object a warning for each folder.
+    A transparent picture that is black and white but for soft edges is no cut-out: it is black
+    where it is transparent. A mask of the shape of `size` is resampled to it. One of 0 and 1 alone
+    means black and white. One without any object is an error, one that is all object a warning for
+    each folder.
     """
     picture = read_picture(path, size, _EIGHT_BIT_MODES)
     pixels = np.array(picture.convert("L"))
     if picture.has_transparency_data:
         alpha = np.array(picture.convert("RGBA").getchannel("A"))
-        pixels = alpha if alpha.min() < 255 else pixels
+        shown = pixels[alpha > 0]
+        is_mask = np.isin(shown, (0, 1, 255)).sum() >= _LEAST_PURE * shown.size
+        is_cut_out = alpha.min() < 255 and not is_mask
+        pixels = alpha if is_cut_out else np.array(_on_ground(picture, 0).convert("L"))
     pixels = nearest_pixels(pixels, size)
     if not pixels.any():
         raise InputError(

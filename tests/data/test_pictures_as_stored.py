@@ -204,6 +204,20 @@ def test_a_cut_out_as_mask_is_black_where_it_is_transparent(tmp_path):
     assert torch.equal(mask, torch.tensor([0.0] * 4 + [1.0] * 4).expand(4, 8))
 
 
+@pytest.mark.parametrize(("white", "edge"), [(1, 1), (255, 255), (255, 128)])
+@pytest.mark.parametrize("alpha", ["one pixel", "254 throughout"])
+def test_a_black_and_white_mask_stays_one_whatever_its_transparency(tmp_path, alpha, edge, white):
+    truth = np.zeros((32, 32), np.uint8)
+    truth[8:20, 8:20] = white
+    truth[8, 8:20] = edge
+    pixels = np.dstack([truth, truth, truth, np.full_like(truth, 255)])
+    pixels[..., 3] = 254 if alpha == "254 throughout" else pixels[..., 3]
+    pixels[0, 0, 3] = 0
+    Image.fromarray(pixels).save(tmp_path / "mask.png")
+    mask = read_mask(tmp_path / "mask.png", (32, 32))
+    torch.testing.assert_close(mask, torch.from_numpy(truth) / white, rtol=0, atol=1.01 / 255)
+
+
 def test_a_mask_of_zero_and_one_is_black_and_white(tmp_path):
     truth = _RNG.integers(0, 2, (6, 10)).astype(np.uint8)
     Image.fromarray(truth).save(tmp_path / "mask.png")
