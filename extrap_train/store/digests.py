@@ -29,15 +29,15 @@ def file_digest(path: Path) -> str:
         stamp = _stamp(path)
         if stamp[0] < _LARGE_BYTES:
             return _hash_file(path)
-        name = hashlib.sha256(f"{path.resolve()}\0{stamp}".encode(errors="surrogateescape"))
-        record = cache_folder("digests") / name.hexdigest()
-        if (known := _read_known(record)) is not None:
+        name = hashlib.sha256(os.fsencode(path.resolve())).hexdigest()
+        record = cache_folder("digests") / name
+        if (known := _read_known(record, stamp)) is not None:
             return known
         digest = _hash_file(path)
         settled = time.time_ns() - max(stamp[1:3]) > _SETTLED_NS
         if settled and _stamp(path) == stamp:
             with suppress(InputError):  # a full or read-only home costs only time
-                write_atomic(record, digest.encode())
+                write_atomic(record, f"{digest} {stamp}".encode())
         return digest
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
@@ -91,10 +91,11 @@ def cache_folder(kind: str) -> Path:
     return Path(given or Path.home() / ".cache") / "extrap-train" / kind
 
 
-def _read_known(record: Path) -> str | None:
-    """None where there is none yet, or it is damaged: the file itself says."""
+def _read_known(record: Path, stamp: list[int]) -> str | None:
+    """None where there is none yet, it is of another content or damaged: the file itself says."""
     try:
-        known = record.read_text()
+        known, _, known_stamp = record.read_text().partition(" ")
     except (OSError, ValueError):
         return None
-    return known if re.fullmatch("[0-9a-f]{64}", known) else None
+    is_same = known_stamp == str(stamp)
+    return known if is_same and re.fullmatch("[0-9a-f]{64}", known) else None

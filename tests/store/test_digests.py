@@ -51,6 +51,14 @@ def test_a_file_that_changed_is_read_again_even_with_its_old_time_and_size(
     assert file_digest(file) == _sha(b"six")
 
 
+def test_a_file_that_changes_again_and_again_has_one_record(kept: Path, tmp_path: Path) -> None:
+    for name in ("weights", "other"):
+        for content in (b"one", b"two, longer", b"three, longer still"):
+            (tmp_path / name).write_bytes(content)
+            assert file_digest(tmp_path / name) == _sha(content)
+    assert len([path for path in kept.rglob("*") if path.is_file()]) == 2
+
+
 @pytest.mark.parametrize("damage", [b"", b"\xff" * 64, b"0" * 63])
 def test_a_damaged_record_costs_only_time(kept: Path, tmp_path: Path, damage: bytes) -> None:
     file = tmp_path / "weights"
