@@ -17,7 +17,7 @@ from extrap_train.runs import (
     run_identity,
 )
 from extrap_train.store.manifest import Manifest, Split
-from extrap_train.tasks.category import _opened
+from extrap_train.tasks.category import _open_run
 from extrap_train.terminal import terminal
 
 _SPLIT = Split("synthetic", ("0001",), ("0000",))
@@ -40,7 +40,7 @@ def opened(config: TrainConfig, key: str = "key") -> RunFolder:
     require_same_options(folder, config)
     inputs = {"data of hydrant": key}
     manifest = Manifest.of(run_identity(config), inputs, {"hydrant": _SPLIT})
-    with _opened(folder, config, manifest, terminal(quiet=True)):
+    with _open_run(folder, config, manifest, terminal(quiet=True)):
         return folder
 
 

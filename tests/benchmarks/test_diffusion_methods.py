@@ -18,7 +18,7 @@ from benchmarks.catalogue import Catalogue
 from benchmarks.methods import adapted
 from benchmarks.methods.adapted import AdaptedDiffusion
 from benchmarks.methods.base import Method, SceneInputs, Unavailable
-from benchmarks.methods.diffusion import Diffusion, _loaded
+from benchmarks.methods.diffusion import Diffusion, _load_cached
 from benchmarks.methods.incremental import IncrementalDiffusion
 from benchmarks.report.aggregate import read_results
 from benchmarks.run.plan import TableFolder
@@ -59,9 +59,9 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
 @pytest.fixture(autouse=True)
 def _own_models() -> Iterator[None]:
     """No test sees what another one has left in a model."""
-    _loaded.cache_clear()
+    _load_cached.cache_clear()
     yield
-    _loaded.cache_clear()
+    _load_cached.cache_clear()
 
 
 @pytest.fixture
@@ -91,7 +91,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, list[View], Tensor
 
 
 def _state(weights: str) -> dict[str, Tensor]:
-    return {k: v.clone() for k, v in _loaded(Path(weights)).state_dict().items()}
+    return {k: v.clone() for k, v in _load_cached(Path(weights)).state_dict().items()}
 
 
 def _with_other_photograph(inputs: SceneInputs, index: int) -> SceneInputs:
@@ -125,7 +125,7 @@ def test_it_generates_the_targets_and_repeats_itself(name: str, weights: str) ->
     assert made.seconds > 0
     assert made.given["weights"] == "tiny"
     assert made.given["made at"] == "32 px"
-    _loaded.cache_clear()
+    _load_cached.cache_clear()
     torch.manual_seed(5)
     assert torch.equal(method.synthesize(inputs).images, made.images)
 
@@ -153,7 +153,7 @@ def test_an_adapter_is_its_scenes_alone(weights: str) -> None:
     method = AdaptedDiffusion(weights=weights, lora_steps=STEPS)
     alone = method.synthesize(other)
     assert alone.counts["kept_step"] > 0
-    _loaded.cache_clear()
+    _load_cached.cache_clear()
     plain = Diffusion(weights=weights).synthesize(one)
     before = _state(weights)
     first = method.synthesize(one)
@@ -161,10 +161,10 @@ def test_an_adapter_is_its_scenes_alone(weights: str) -> None:
     assert first.given["adaptation ended by"] == "steps"
     assert first.counts["kept_step"] > 0
     assert not torch.equal(first.images, plain.images)
-    after = _loaded(Path(weights)).state_dict()
+    after = _load_cached(Path(weights)).state_dict()
     assert list(after) == list(before)
     assert all(torch.equal(after[name], value) for name, value in before.items())
-    assert not any(p.requires_grad for p in _loaded(Path(weights)).parameters())
+    assert not any(p.requires_grad for p in _load_cached(Path(weights)).parameters())
     assert torch.equal(method.synthesize(other).images, alone.images)
     assert torch.equal(Diffusion(weights=weights).synthesize(one).images, plain.images)
 
@@ -179,7 +179,7 @@ def test_an_adapter_goes_even_where_adapting_fails(
     before = _state(weights)
     with pytest.raises(RuntimeError, match="no luck"):
         AdaptedDiffusion(weights=weights).synthesize(scene_inputs()[0])
-    assert list(_loaded(Path(weights)).state_dict()) == list(before)
+    assert list(_load_cached(Path(weights)).state_dict()) == list(before)
 
 
 def test_time_is_a_limit_that_the_row_tells_of(weights: str) -> None:
