@@ -28,6 +28,7 @@ from extrap_train.errors import InputError
 from extrap_train.store.atomic import partial_path, write_atomic
 from extrap_train.store.digests import folder_digest, weights_digest
 from extrap_train.store.manifest import (
+    REMEDY,
     Manifest,
     Split,
     code_version,
@@ -35,7 +36,7 @@ from extrap_train.store.manifest import (
     read_manifest,
     require_same,
 )
-from extrap_train.store.records import read_record
+from extrap_train.store.records import read_record, read_yaml
 
 _NOT_PART_OF_THE_RUN = (
     "output",
@@ -228,6 +229,8 @@ def require_same_options(folder: RunFolder, config: TrainConfig) -> None:
         return
     before = read_manifest(folder.path)
     require_same(folder.path, Manifest.of(run_identity(config), before.inputs, before.split))
+    if folder.options.exists() and "trainer" not in read_yaml(folder.options, REMEDY):
+        raise InputError(f"{folder.options}: does not hold the options of a run; {REMEDY}")
 
 
 def write_options(folder: RunFolder, config: TrainConfig, *, at_least: int) -> None:

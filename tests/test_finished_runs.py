@@ -140,6 +140,25 @@ def test_a_single_command_does_not_share_a_sweeps_run(
     assert opened(config) != alone
 
 
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"\xff\xfe\xfa",
+        b"a: &a [*a]",
+        b"a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]",
+        b"[" * 20_000,
+        b"- a",
+        b"model: resnet\nepochs: 90",
+    ],
+)
+def test_options_of_somebody_else_are_not_overwritten(config: TrainConfig, content: bytes) -> None:
+    saved = begun(replace(config, run="mine")).options
+    saved.write_bytes(content)
+    with pytest.raises(InputError, match=r"config\.yaml: .*run=NAME"):
+        opened(replace(config, run="mine"))
+    assert saved.read_bytes() == content
+
+
 def test_a_run_answers_for_fewer_steps_measured_alike(config: TrainConfig, tmp_path: Path) -> None:
     run = RunFolder(tmp_path)
     run.summary.write_text(_summary(20))
