@@ -74,7 +74,7 @@ def test_a_pushed_model_is_loaded_from_a_clean_cache_and_again_without_the_hub(
         names = [_PUSHED, f"{_PUSHED}@{commit}", "me/pickles", "me/none", f"{_PUSHED}@v9"]
         newest, pinned, pickles, nobody, unknown = _ask(hub, cache, *names)
         assert [Path(newest).name, Path(pinned).name] == [later, commit]
-        assert "not a model of this project" in pickles
+        assert "no model of this project" in pickles
         assert "no such repository" in nobody
         assert "no revision v9" in unknown
         assert not any(name.endswith(".bin") for name in hub.downloads)
