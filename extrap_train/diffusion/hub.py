@@ -4,6 +4,7 @@ A repository is downloaded once, as safetensors and JSON, and then found in the 
 without a network.
 """
 
+import logging
 import re
 from functools import cache
 from pathlib import Path
@@ -42,9 +43,23 @@ def weights_folder(name: str, option: str) -> Path:
 
 
 def is_repository(name: str) -> bool:
-    """Whether this can only be the name of a repository: it has one slash, and no path is so."""
-    is_file = Path(name).suffix in _WEIGHT_FILES
-    return bool(_NAME.fullmatch(name)) and not is_file and not Path(name).exists()
+    """Whether this can only be the name of a repository: it has one slash, and no path is so.
+
+    Without a revision, it is a mistyped path where the part before the slash is a folder here.
+    """
+    found = _NAME.fullmatch(name)
+    if found is None or Path(name).suffix in _WEIGHT_FILES or Path(name).exists():
+        return False
+    return found["revision"] is not None or not Path(name).parent.is_dir()
+
+
+def pinned(name: str, option: str) -> str:
+    """The name of a repository's commit, where its own name means another one some day; other
+    names as they are.
+    """
+    if not is_repository(name):
+        return name
+    return f"{name.partition('@')[0]}@{weights_folder(name, option).name}"
 
 
 @cache  # a command sees one revision of it
@@ -52,6 +67,7 @@ def _download(name: str, option: str) -> Path:
     parts = _NAME.fullmatch(name)
     assert parts is not None
     repository, revision = parts["repo"], parts["revision"]
+    logging.getLogger("huggingface_hub.utils._http").setLevel(logging.ERROR)  # says every retry
     said, place = f"{option}={name}", f"{constants.ENDPOINT}/{repository}"
     try:
         # First what says that it is ours: others' models may be large.
