@@ -3,7 +3,7 @@
 import base64
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Thread
@@ -22,13 +22,17 @@ class Hub:
         self.downloads: list[str] = []
         self.address = ""
 
-    def add(self, repository: str, files: Files) -> str:
-        """A commit with these files beside those of the last one."""
+    def add(self, repository: str, files: Files, removed: Sequence[str] = ()) -> str:
+        """A commit with these files beside those of the last one that are not removed."""
         commits = self.commits.setdefault(repository, {})
         last = next(reversed(commits.values()), {})
         commit = hashlib.sha1(f"{repository}{len(commits)}".encode()).hexdigest()
-        commits[commit] = last | files
+        commits[commit] = {x: y for x, y in last.items() if x not in removed} | files
         return commit
+
+    def newest(self, repository: str) -> tuple[str, Files]:
+        """The last commit and its files."""
+        return next(reversed(self.commits[repository].items()))
 
     def find(self, repository: str, revision: str) -> str | None:
         """The commit that a revision means."""
@@ -72,7 +76,8 @@ class _Handler(BaseHTTPRequestHandler):
             name = f"{said['organization']}/{said['name']}"
             if said.get("private") or said.get("visibility") == "private":
                 self.hub.private.add(name)
-            self.hub.commits.setdefault(name, {})
+            if name not in self.hub.commits:
+                self.hub.add(name, {".gitattributes": b""})
             self._answer({"url": f"{self.hub.address}/{name}"})
         elif words == ["api", "validate-yaml"]:
             self._answer({"errors": [], "warnings": []})
@@ -84,7 +89,9 @@ class _Handler(BaseHTTPRequestHandler):
             lines = [json.loads(line) for line in body.splitlines()]
             files = [line["value"] for line in lines if line["key"] == "file"]
             name = "/".join(words[2:4])
-            commit = self.hub.add(name, {x["path"]: base64.b64decode(x["content"]) for x in files})
+            removed = [x["value"]["path"] for x in lines if x["key"] == "deletedFile"]
+            added = {x["path"]: base64.b64decode(x["content"]) for x in files}
+            commit = self.hub.add(name, added, removed)
             url = f"{self.hub.address}/{name}/commit/{commit}"
             self._answer({"commitUrl": url, "commitOid": commit})
         else:

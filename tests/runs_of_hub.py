@@ -11,7 +11,7 @@ from extrap_train.store.manifest import MANIFEST, Manifest, Split
 from extrap_train.store.records import write_record, write_summary
 
 
-def finished_run(folder: Path, start: Path | None = None, capture: str = "0001") -> RunFolder:
+def finished_run(folder: Path, start: Path | str | None = None, capture: str = "0001") -> RunFolder:
     """Trained on one rendered capture, by default from somebody's weights in the same folder."""
     run = RunFolder(folder / "run")
     unet = UNetConfig([16, 32], 1, [False, True], 2, 16, 16)

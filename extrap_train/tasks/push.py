@@ -3,10 +3,11 @@
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, replace
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-from huggingface_hub import CommitOperationAdd, HfApi
+from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi
 
 from extrap_train.config import MODEL_CONFIG, PACKAGED_MODELS, TrainConfig, packaged_names
 from extrap_train.diffusion.hub import (
@@ -16,7 +17,7 @@ from extrap_train.diffusion.hub import (
     is_repository,
     weights_folder,
 )
-from extrap_train.diffusion.leakage import trainings_of
+from extrap_train.diffusion.leakage import record_of, trainings_of, unrecorded
 from extrap_train.diffusion.model_files import is_own, load_model, saved_config
 from extrap_train.errors import InputError
 from extrap_train.runs import RunFolder, existing_run
@@ -24,6 +25,9 @@ from extrap_train.store.manifest import MANIFEST, Split, read_manifest
 from extrap_train.tasks.model_card import model_card
 from extrap_train.tasks.scene_model import UsedWeights
 from extrap_train.terminal import terminal
+
+_LOCAL = "local:"
+"""Before the name of a start that only lies where the model was trained."""
 
 
 def run(config: TrainConfig) -> None:
@@ -42,12 +46,22 @@ def run(config: TrainConfig) -> None:
         }
         files |= {"README.md": card.encode(), **_records(folder)}
         added = [CommitOperationAdd(name, content) for name, content in files.items()]
-        commit = api.create_commit(config.repo, added, commit_message="Upload the model")
+        # An earlier model's files would be taken for this one's.
+        removed = [
+            CommitOperationDelete(name)
+            for name in api.list_repo_files(config.repo)
+            if name not in files and any(fnmatch(name, pattern) for pattern in FILES)
+        ]
+        commit = api.create_commit(
+            config.repo, [*added, *removed], commit_message="Upload the model"
+        )
     except HUB_FAILURES as error:
         raise InputError(
             f"repo={config.repo}: {first_line(error)}; check the name and the network, and log in "
             "with a token that may write (hf auth login)"
         ) from None
+    if removed:
+        console.print(f"{len(removed)} files of an earlier model are no longer there")
     console.print(f"{len(added)} files; a new repository is private until you open it there")
     console.print(f"use it: weights={config.repo}@{commit.oid}\nresult: {place}")
 
@@ -58,17 +72,28 @@ def _files(folder: Path) -> list[Path]:
 
 def _records(folder: Path) -> dict[str, bytes]:
     """The model's configuration and its run's manifest, without the places of this machine."""
-    model, beside = saved_config(folder), folder.resolve().parent
-    start = model.start
-    if start not in (None, *packaged_names()) and not is_repository(str(start)):
-        model = replace(model, start=f"local:{Path(str(start)).name}")
+    model, place = saved_config(folder), record_of(folder)
+    start, name = model.start, str(folder)
+    if start is not None and not _can_be_followed(start):
+        model = replace(model, start=f"{_LOCAL}{Path(start).name}")
+    is_lost = model.start != start  # whoever downloads it cannot follow the start
+    if is_lost and name in unrecorded(name) and any(trainings_of(name)):
+        raise InputError(
+            f"weights={name}: no {MANIFEST} says what it was trained on, and it started from a "
+            "model that only you have; give its run's folder, which has that file"
+        )
     records: dict[str, Any] = {MODEL_CONFIG: model}
-    if (beside / MANIFEST).is_file():
-        manifest = replace(read_manifest(beside), options={})
-        if model.start != start:  # whoever downloads it cannot follow the start
+    if place is not None:
+        manifest = replace(read_manifest(place), options={})
+        if is_lost:
             manifest = replace(manifest, split=_all_seen(folder, manifest.split))
         records[MANIFEST] = manifest
-    return {name: json.dumps(asdict(x), indent=1).encode() for name, x in records.items()}
+    return {file: json.dumps(asdict(x), indent=1).encode() for file, x in records.items()}
+
+
+def _can_be_followed(start: str) -> bool:
+    """Whether a start's name leads as far elsewhere as it does here."""
+    return start in packaged_names() or is_repository(start) or start.startswith(_LOCAL)
 
 
 def _all_seen(folder: Path, split: Mapping[str, Split]) -> dict[str, Split]:

@@ -25,7 +25,7 @@ from extrap_train.diffusion.leakage import trainings_of
 from extrap_train.diffusion.model_files import initial_model, load_model, saved_config
 from extrap_train.errors import InputError
 from extrap_train.runs import run_manifest
-from extrap_train.tasks.model_card import _licence_of
+from extrap_train.tasks.model_card import _licence_of, model_card
 from extrap_train.tasks.scene_model import UsedWeights
 
 _PUSHED = "me/small.hydrants-v1.5"
@@ -67,7 +67,7 @@ def test_a_pushed_model_is_loaded_from_a_clean_cache_and_again_without_the_hub(
         monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", hub.address)
         said = run_command(main, *words)
         assert hub.private == {_PUSHED}
-        ((commit, files),) = hub.commits[_PUSHED].items()
+        commit, files = hub.newest(_PUSHED)
         assert f"weights={_PUSHED}@{commit}" in said
         later = hub.add(_PUSHED, {"README.md": b"# other words"})
         hub.add("me/pickles", {"pytorch_model.bin": b"\x80", "config.json": b"{}"})
@@ -107,9 +107,70 @@ def test_the_manifest_that_is_pushed_has_what_local_starts_have_seen(
         monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", hub.address)
         words = ["task=push", "category=hydrant", f"weights={second.model}", "repo=me/second"]
         run_command(main, *words)
-    (files,) = hub.commits["me/second"].values()
+    _, files = hub.newest("me/second")
     assert json.loads(files["extrapolation_model.json"])["start"] == "local:model"
     assert json.loads(files["manifest.json"])["split"]["hydrant"]["train"] == ["0001", "0002"]
+
+
+def _push(hub: Hub, monkeypatch: pytest.MonkeyPatch, weights: object, repo: str) -> str:
+    monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", hub.address)
+    return run_command(main, "task=push", "category=hydrant", f"weights={weights}", f"repo={repo}")
+
+
+def test_a_second_push_leaves_nothing_of_the_first_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = finished_run(tmp_path)
+    with serve_hub() as hub:
+        _push(hub, monkeypatch, "ours-hydrant", "me/twice")
+        hub.add("me/twice", {"results/picture.png": b"\x89"})
+        assert {"difference.safetensors", "manifest.json"} <= hub.newest("me/twice")[1].keys()
+        (run.path / "manifest.json").unlink()
+        _push(hub, monkeypatch, run.model, "me/twice")
+    _, files = hub.newest("me/twice")
+    assert "unet/diffusion_pytorch_model.safetensors" in files
+    assert not {"difference.safetensors", "manifest.json"} & files.keys()
+    assert {".gitattributes", "results/picture.png"} <= files.keys()
+
+
+def test_a_model_whose_starts_would_be_forgotten_is_not_pushed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = finished_run(tmp_path / "first")
+    second = finished_run(tmp_path / "second", start=first.model, capture="0002")
+    (second.path / "manifest.json").unlink()
+    with serve_hub() as hub:
+        monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", hub.address)
+        words = ["task=push", "category=hydrant", f"weights={second.model}", "repo=me/second"]
+        assert "manifest.json" in refused_command(words, tmp_path)
+    assert "extrapolation_model.json" not in hub.newest("me/second")[1]
+
+
+def test_a_downloaded_model_is_pushed_again_with_its_record(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = finished_run(tmp_path / "own")
+    run.model.rename(tmp_path / "snapshot")
+    (run.path / "manifest.json").rename(tmp_path / "snapshot" / "manifest.json")
+    with serve_hub() as hub:
+        _push(hub, monkeypatch, tmp_path / "snapshot", "me/again")
+    _, files = hub.newest("me/again")
+    assert json.loads(files["manifest.json"])["split"]["hydrant"]["train"] == ["0001"]
+    assert "1 captures" in files["README.md"].decode()
+
+
+def test_a_card_says_what_the_starts_were_trained_on(tmp_path: Path) -> None:
+    first = finished_run(tmp_path / "first", start="base")
+    second = finished_run(tmp_path / "second", start=first.model, capture="0002")
+    assert ModelCard(model_card(second.model, "me/x", 7)).data.license == "apache-2.0"
+    record = first.path / "manifest.json"
+    record.write_text(record.read_text().replace("synthetic", "co3d"))
+    card = ModelCard(model_card(second.model, "me/x", 7))
+    assert card.data.license == "other"
+    assert "CO3D (CC BY-NC 4.0)" in card.text
+    assert "an earlier model" in card.text
+    record.unlink()
+    assert ModelCard(model_card(second.model, "me/x", 7)).data.license == "other"
 
 
 @pytest.fixture
@@ -170,7 +231,18 @@ def test_paths_and_files_are_no_repositories(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "runs" / "mine").mkdir(parents=True)
     assert all(map(is_repository, ["a/b", "a/b@main", "org-1/v1.5@refs/pr/1"]))
-    others = ["runs/mine", "./b", "../b", "/a/b", "a/b/c", "runs/b.ckpt", "a/b@", *packaged_names()]
+    assert is_repository("runs/mistyped@main")
+    others = [
+        "runs/mine",
+        "runs/mistyped",
+        "./b",
+        "../b",
+        "/a/b",
+        "a/b/c",
+        "runs/b.ckpt",
+        "a/b@",
+        *packaged_names(),
+    ]
     assert not any(map(is_repository, others))
 
 
