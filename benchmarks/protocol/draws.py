@@ -78,7 +78,7 @@ def write_sealed(file: Path, record: object) -> None:
 
 
 def is_sealed(file: Path) -> bool:
-    """Whether a file holds what `write_sealed` wrote; InputError where it is no JSON."""
+    """Whether a file holds what `write_sealed` wrote; InputError if it is not JSON."""
     content = read_json(file)
     return bool(content.pop("sha256", None) == digest(content))
 
