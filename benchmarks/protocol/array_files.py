@@ -81,7 +81,7 @@ def _decode(content: bytes, side: int, file: Path) -> UInt8[np.ndarray, "side si
     except InputError:
         raise
     except DECODER_ERRORS:
-        raise InputError(f"{file}: is no PNG picture; run the table again") from None
+        raise InputError(f"{file}: is not a PNG picture; run the table again") from None
 
 
 def npy_bytes(values: Tensor) -> bytes:

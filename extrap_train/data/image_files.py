@@ -37,7 +37,7 @@ DECODER_ERRORS = (
 BACKGROUND = 255
 """What a photograph shows where it is transparent: white, whatever colour is hidden there."""
 _LEAST_PURE = 0.9
-"""Of what a transparent picture shows, the share in pure black or white that makes it a mask."""
+"""Share of pure black and white in what a transparent picture shows that makes it a mask."""
 _EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr")
 _ORIENTATION_TAG, _EXIF_TAG, _FOCAL_LENGTH_35MM_TAG = 0x0112, 0x8769, 0xA405
 _QUARTER_TURNS = (5, 6, 7, 8)

@@ -92,8 +92,8 @@ def _read(path: Path) -> PlyData:
         raise InputError(f"{path}: no such file") from None
     except (PlyParseError, ValueError, KeyError, MemoryError) as error:
         raise InputError(
-            f"{path}: is no PLY file with vertices ({error}); export it again"
+            f"{path}: is not a PLY file with vertices ({error}); export it again"
         ) from None
     if "vertex" not in content:
-        raise InputError(f"{path}: is no PLY file with vertices; export it again")
+        raise InputError(f"{path}: is not a PLY file with vertices; export it again")
     return content

@@ -88,12 +88,12 @@ def test_bad_files_are_named(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         read_splats(path)
     path.write_bytes(b"no ply at all")
-    with pytest.raises(InputError, match="no PLY file"):
+    with pytest.raises(InputError, match="is not a PLY file"):
         read_splats(path)
     gaussians = random_gaussians(4)
     write_splats(path, gaussians)
     path.write_bytes(path.read_bytes()[:-7])
-    with pytest.raises(InputError, match="no PLY file"):
+    with pytest.raises(InputError, match="is not a PLY file"):
         read_splats(path)
     gaussians.means[2, 1] = float("nan")
     write_splats(path, gaussians)

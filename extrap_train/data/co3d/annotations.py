@@ -233,5 +233,5 @@ def _require_type(value: Any, kind: type, what: str) -> Any:
     if not isinstance(value, kind):
         raise TypeError(f"{what} is {value!r}, expected {kind.__name__}")
     if isinstance(value, str) and any("\ud800" <= letter <= "\udfff" for letter in value):
-        raise ValueError(f"{what} {value!a} is no Unicode")  # tables and hashes cannot take it
+        raise ValueError(f"{what} {value!a} is not Unicode")  # tables and hashes cannot take it
     return value
