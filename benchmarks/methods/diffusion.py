@@ -33,7 +33,7 @@ from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.model_files import load_model
 from extrap_train.diffusion.packaged import packaged_name
 from extrap_train.errors import InputError
-from extrap_train.store.digests import files_below
+from extrap_train.store.digests import model_files
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Diffusion:
 
     def weight_files(self, category: str) -> Sequence[Path]:
         """The files of the model's folder."""
-        return list(files_below(self._folder(category)))
+        return list(model_files(self._folder(category)))
 
     def synthesize(self, inputs: SceneInputs) -> Synthesis:
         """Generate every target.

@@ -4,13 +4,14 @@ import hashlib
 import os
 import re
 import time
-from collections.abc import Iterator, Set
+from collections.abc import Iterable, Iterator, Set
 from contextlib import suppress
 from pathlib import Path
 
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import write_atomic
 
+_MODEL_SUFFIXES = (".safetensors", ".json", ".bin", ".ckpt", ".pt", ".pth")
 _LARGE_BYTES = 64 * 2**20
 """Larger files are worth a record: below, hashing takes less than a tenth of a second."""
 _SETTLED_NS = 2 * 10**9
@@ -64,15 +65,28 @@ def files_below(folder: Path, above: Set[Path] = frozenset()) -> Iterator[Path]:
 
 def folder_digest(folder: Path) -> str:
     """SHA-256 of the names and contents of all files below a folder, wherever it lies."""
+    return _files_digest(folder, files_below(folder))
+
+
+def _files_digest(folder: Path, files: Iterable[Path]) -> str:
     digest = hashlib.sha256()
-    for path in files_below(folder):
+    for path in files:
         digest.update(f"{path.relative_to(folder).as_posix()}\0{file_digest(path)}\n".encode())
     return digest.hexdigest()
 
 
+def model_files(folder: Path) -> Iterator[Path]:
+    """The files of a model's folder that are read, sorted; what other tools put beside them, as a
+    card, is none of them.
+    """
+    return (path for path in files_below(folder) if path.suffix in _MODEL_SUFFIXES)
+
+
 def weights_digest(weights: Path) -> str:
     """SHA-256 of a file of weights, or of a model's folder."""
-    return folder_digest(weights) if weights.is_dir() else file_digest(weights)
+    if weights.is_dir():
+        return _files_digest(weights, model_files(weights))
+    return file_digest(weights)
 
 
 def _hash_file(path: Path) -> str:

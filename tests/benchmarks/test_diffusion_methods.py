@@ -104,11 +104,11 @@ def _with_other_photograph(inputs: SceneInputs, index: int) -> SceneInputs:
 
 def test_its_weight_files_are_also_those_that_a_link_leads_to(tmp_path: Path) -> None:
     (tmp_path / "unet").mkdir()
-    (tmp_path / "unet" / "weights").touch()
+    (tmp_path / "unet" / "weights.safetensors").touch()
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "unet").symlink_to(tmp_path / "unet")
     files = Diffusion(weights=str(tmp_path / "model")).weight_files("analytic")
-    assert files == [tmp_path / "model" / "unet" / "weights"]
+    assert files == [tmp_path / "model" / "unet" / "weights.safetensors"]
 
 
 @pytest.mark.usefixtures("cheap")
