@@ -53,7 +53,7 @@ def is_repository(name: str) -> bool:
     return found["revision"] is not None or not Path(name).parent.is_dir()
 
 
-def pinned(name: str, option: str) -> str:
+def pin_revision(name: str, option: str) -> str:
     """The name of a repository's commit, where its own name means another one some day; other
     names as they are.
     """

@@ -6,6 +6,7 @@ import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -32,6 +33,7 @@ from extrap_train.diffusion.checkpoints import (
     step_of,
     thin_checkpoints,
 )
+from extrap_train.diffusion.hub import pin_revision
 from extrap_train.diffusion.model import ExtrapolationModel, use_channels_last
 from extrap_train.diffusion.model_files import initial_model, save_model
 from extrap_train.diffusion.training import CategoryTraining
@@ -170,8 +172,10 @@ def quieten_lightning() -> None:
 
 def _model(config: TrainConfig) -> ExtrapolationModel:
     torch.manual_seed(config.seed)
-    start = resolve_paths(config.model)  # the saved model says for good what it started from
-    model = use_channels_last(initial_model(start))
+    options = resolve_paths(config.model)
+    if options.start is not None:  # the saved model says for good what it started from
+        options = replace(options, start=pin_revision(options.start, "model.start"))
+    model = use_channels_last(initial_model(options))
     if config.trainer.gradient_checkpointing:
         model.unet.enable_gradient_checkpointing()
     if config.trainer.compile:
