@@ -26,9 +26,15 @@ from extrap_train.data.sequences import NO_CATEGORY, FrameSequence
 from extrap_train.data.synthetic import build_scene, surface_points
 from extrap_train.data.synthetic.capture import synthetic_sequence
 from extrap_train.data.transforms_json import TRANSFORMS, read_transforms
-from extrap_train.diffusion.leakage import TrainedCaptures, trainings_of
+from extrap_train.diffusion.hub import is_repository, weights_folder
+from extrap_train.diffusion.leakage import (
+    TrainedCaptures,
+    UnrecordedCaptures,
+    trainings_of,
+    unrecorded_models,
+)
 from extrap_train.errors import InputError
-from extrap_train.store.manifest import Split
+from extrap_train.store.manifest import MANIFEST, Split
 from extrap_train.store.records import read_record
 from extrap_train.views import stack_poses
 
@@ -44,24 +50,69 @@ class Capture:
     surface: Callable[[], TrueSurface] | None = None
 
 
-Trained = Sequence[tuple[str, TrainedCaptures, bool]]
-"""Methods by name with what their weights, or those that they started from, were trained on; and
-whether it is the weights themselves.
-"""
+@dataclass(frozen=True)
+class UsedTraining:
+    """What a method's weights, or those that they started from, were trained on."""
+
+    method: str
+    option: str | None
+    """Names the weights; None where the method may use any packaged model."""
+    captures: TrainedCaptures
+    is_of_weights: bool
+    """Whether of the weights themselves."""
+
+    def require_unseen(self, category: str, held_out: Split) -> None:
+        """InputError for a capture that the model was trained on, or may have been."""
+        if not (leaks := self.captures.find_leaks(category, held_out)):
+            return
+        model, capture = self.captures.model, f"{category}/{leaks[0]}"
+        named = f"{self.option}: " if self.option else f"{self.method} may use packaged models: "
+        said = f"{model} was trained on the capture {capture}"
+        if isinstance(self.captures, UnrecordedCaptures):
+            said = f"no {MANIFEST} says that {model} was not trained on the capture {capture}"
+        others = " or other weights" if self.option else ""
+        raise InputError(
+            f"{named}{said}; give captures that it has not seen (captures.sequences, "
+            f"captures.seed, captures.scenes){others}"
+        )
+
+
+Trained = Sequence[UsedTraining]
 
 
 def trained_models(methods: Iterable[MethodConfig], categories: Collection[str]) -> Trained:
     """What the methods' models were trained on, as far as that is known.
 
-    A method that names no `weights` may use any packaged model; those have one training.
+    A method that names no `weights` may use any packaged model; those have one training. Weights
+    that cannot be downloaded are left out: the method is unavailable with them, and says why.
     """
     found = []
     for method in methods:
-        weights = method.options.get("weights") or "base"
-        for folder in sorted({str(weights).replace("{category}", c) for c in categories or [""]}):
-            seen = trainings_of(folder)
-            found += [(method.name, training, training.model == folder) for training in seen]
+        named = method.options.get("weights")
+        option = f"options.{method.name}.weights"
+        for weights in sorted(
+            {str(named or "base").replace("{category}", c) for c in categories or [""]}
+        ):
+            if is_repository(weights) and not _is_there(weights, option):
+                continue
+            trainings = [*trainings_of(weights, option)]
+            trainings += [
+                UnrecordedCaptures(model, "", Split("", (), ()))
+                for model in unrecorded_models(weights, option)
+            ]
+            found += [
+                UsedTraining(method.name, option if named else None, t, t.model == weights)
+                for t in trainings
+            ]
     return found
+
+
+def _is_there(repository: str, option: str) -> bool:
+    try:
+        weights_folder(repository, option)
+    except InputError:
+        return False
+    return True
 
 
 def _held_out_by_all(
@@ -70,14 +121,15 @@ def _held_out_by_all(
     """Up to `count` test captures that every model of a category holds out, in the order of a
     split; None where there is no model of it. Raises InputError where there are none.
     """
-    trained = [t for t in trained if (t[1].category, t[1].split.source) == (category, "co3d")]
-    tested = [training.split.test for _, training, is_used in trained if is_used]
+    known = [(t.captures, t.is_of_weights) for t in trained if t.captures.category == category]
+    known = [(captures, is_used) for captures, is_used in known if captures.split.source == "co3d"]
+    tested = [captures.split.test for captures, is_used in known if is_used]
     if not tested:
         return None
-    seen = [training.split.train for _, training, _ in trained]
+    seen = [captures.split.train for captures, _ in known]
     common = set(present).intersection(*tested).difference(*seen)
     if not common:
-        runs = " and ".join(sorted({training.model for _, training, _ in trained}))
+        runs = " and ".join(sorted({captures.model for captures, _ in known}))
         raise InputError(
             f"{category}: none of the {len(present)} captures is held out by {runs}; test on "
             "other captures, or train with more data.test_sequences"
@@ -96,13 +148,8 @@ def open_captures(
     for index, capture in enumerate(captures):
         sequence = capture.sequence
         held_out = _held_out(config, index, sequence.name)
-        for method, training, _ in trained:
-            if training.find_leaks(sequence.category, held_out):
-                raise InputError(
-                    f"options.{method}.weights: {training.model} was trained on the capture "
-                    f"{sequence.category}/{sequence.name}; give captures that it has not seen "
-                    "(captures.sequences, captures.seed, captures.scenes) or other weights"
-                )
+        for training in trained:
+            training.require_unseen(sequence.category, held_out)
     return captures
 
 

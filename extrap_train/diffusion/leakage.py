@@ -65,7 +65,7 @@ def trainings_of(weights: str | None, option: str = "model.start") -> Iterator[T
                 yield TrainedCaptures(name, category, split)
 
 
-def unrecorded(weights: str | None, option: str = "model.start") -> list[str]:
+def unrecorded_models(weights: str | None, option: str = "model.start") -> list[str]:
     """Of the same models those that no run says anything of, the nearest first."""
     recorded = {training.model for training in trainings_of(weights, option)}
     return [name for name, _ in _chain(weights, option) if name not in recorded]

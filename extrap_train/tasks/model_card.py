@@ -10,7 +10,12 @@ from huggingface_hub import ModelCard, ModelCardData
 from extrap_train.config import packaged_names
 from extrap_train.data.json_files import read_json
 from extrap_train.diffusion.hub import HUB_FAILURES, is_repository
-from extrap_train.diffusion.leakage import TrainedCaptures, record_of, trainings_of, unrecorded
+from extrap_train.diffusion.leakage import (
+    TrainedCaptures,
+    record_of,
+    trainings_of,
+    unrecorded_models,
+)
 from extrap_train.diffusion.model_files import is_own, saved_config
 from extrap_train.runs import RunFolder
 from extrap_train.store.manifest import MANIFEST, read_manifest
@@ -33,7 +38,7 @@ def model_card(folder: Path, name: str, steps: int | None) -> str:
     place, trainings = record_of(folder), [*trainings_of(str(folder))]
     code = read_manifest(place).code if place else ""
     start, licence = _start(model.start)
-    is_ours = licence == _OURS and not unrecorded(str(folder))
+    is_ours = licence == _OURS and not unrecorded_models(str(folder))
     is_ours &= {training.split.source for training in trainings} == {"synthetic"}
     head = ModelCardData(
         license="apache-2.0" if is_ours else "other",

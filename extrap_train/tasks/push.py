@@ -17,7 +17,7 @@ from extrap_train.diffusion.hub import (
     is_repository,
     weights_folder,
 )
-from extrap_train.diffusion.leakage import record_of, trainings_of, unrecorded
+from extrap_train.diffusion.leakage import record_of, trainings_of, unrecorded_models
 from extrap_train.diffusion.model_files import is_own, load_model, saved_config
 from extrap_train.errors import InputError
 from extrap_train.runs import RunFolder, existing_run
@@ -77,7 +77,7 @@ def _records(folder: Path) -> dict[str, bytes]:
     if start is not None and not _can_be_followed(start):
         model = replace(model, start=f"{_LOCAL}{Path(start).name}")
     is_lost = model.start != start  # whoever downloads it cannot follow the start
-    if is_lost and name in unrecorded(name) and any(trainings_of(name)):
+    if is_lost and name in unrecorded_models(name) and any(trainings_of(name)):
         raise InputError(
             f"weights={name}: no {MANIFEST} says what it was trained on, and it started from a "
             "model that only you have; give its run's folder, which has that file"

@@ -133,3 +133,27 @@ def test_packaged_models_say_what_they_were_trained_on(weights: str | None) -> N
     named = CapturesConfig(source="scenes", scenes=["synthetic:cup/0010"])
     with pytest.raises(InputError, match=r"captures\.scenes"):
         open_captures(named, ["cup"], _models_of(weights))
+
+
+@pytest.mark.parametrize("start", [None, "base"])
+def test_a_model_without_a_record_is_not_measured_on_what_is_usually_trained_on(
+    tmp_path: Path, start: str | None
+) -> None:
+    """As one that was copied out of its run."""
+    write_record(tmp_path / MODEL_CONFIG, ModelConfig(start=start))
+    first_seen = SyntheticConfig().test_sequences
+    models = _models_of(str(tmp_path))
+    models = [used for used in models if used.method == "mine"]
+    config = CapturesConfig(source="synthetic", sequences=first_seen)
+    assert len(open_captures(config, ["cup"], models)) == first_seen
+    with pytest.raises(InputError, match=rf"options\.mine\.weights: .* cup/000{first_seen};"):
+        open_captures(replace(config, sequences=first_seen + 1), ["cup"], models)
+    open_captures(replace(config, sequences=first_seen + 1, seed=1), ["cup"], models)
+
+
+def test_a_method_that_names_no_weights_is_told_of_captures_alone() -> None:
+    config = CapturesConfig(source="synthetic", sequences=SyntheticConfig().test_sequences + 1)
+    with pytest.raises(InputError, match=r"captures\.sequences") as refused:
+        open_captures(config, ["cup"], _models_of(None))
+    assert ".weights" not in str(refused.value)
+    assert "other weights" not in str(refused.value)

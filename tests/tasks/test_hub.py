@@ -17,14 +17,16 @@ from runs_of_hub import finished_run
 
 from benchmarks.methods.base import Unavailable
 from benchmarks.methods.diffusion import Diffusion
+from benchmarks.protocol.captures import trained_models
 from extrap_train.__main__ import main
-from extrap_train.config import packaged_names
+from extrap_train.config import MethodConfig, packaged_names
 from extrap_train.diffusion import hub as hub_module
 from extrap_train.diffusion.hub import is_repository
 from extrap_train.diffusion.leakage import trainings_of
 from extrap_train.diffusion.model_files import initial_model, load_model, saved_config
 from extrap_train.errors import InputError
 from extrap_train.runs import run_manifest
+from extrap_train.tasks.category import _model
 from extrap_train.tasks.model_card import _licence_of, model_card
 from extrap_train.tasks.scene_model import UsedWeights
 
@@ -181,9 +183,9 @@ def downloaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     known = {"me/downloaded": run.model}
 
     def download(name: str, option: str) -> Path:
-        if name not in known:
+        if (repository := name.partition("@")[0]) not in known:
             raise InputError(f"{option}={name}: cannot be reached")
-        return known[name]
+        return known[repository]
 
     monkeypatch.setattr(hub_module, "_download", download)
     return run.model
@@ -202,6 +204,44 @@ def test_results_and_trainings_follow_from_the_content_of_a_repository(
     assert (training.model, training.split.train) == ("me/downloaded", ("0001",))
     model = initial_model(replace(saved_config(downloaded), start="me/downloaded"))
     assert torch.equal(model.unet.conv_in.weight, load_model(downloaded).unet.conv_in.weight)
+
+
+def test_what_other_tools_add_to_a_download_changes_nothing(
+    downloaded: Path, tmp_path: Path
+) -> None:
+    config = replace(hydrant_config(tmp_path), weights="me/downloaded")
+    before = UsedWeights.of(config).sha256
+    (downloaded / "README.md").write_text("# a card")
+    assert UsedWeights.of(config).sha256 == before
+    files = Diffusion(weights="me/downloaded").weight_files("cup")
+    assert downloaded / "README.md" not in files
+
+
+def test_a_start_of_the_hub_is_saved_with_its_commit(downloaded: Path, tmp_path: Path) -> None:
+    config = hydrant_config(tmp_path)
+    config.model = replace(saved_config(downloaded), start="me/downloaded")
+    assert _model(config).config.start == f"me/downloaded@{downloaded.name}"
+
+
+def test_weights_that_are_not_there_make_a_row_unavailable_and_no_error(
+    downloaded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "outputs").mkdir()
+    for weights in ("me/nobody", "outputs/typo"):
+        method = MethodConfig("ours", factory="a.B", options={"weights": weights})
+        assert trained_models([method], ["cup"]) == []
+        with pytest.raises(Unavailable):
+            Diffusion(weights=weights).weight_files("cup")
+
+
+def test_a_start_that_cannot_be_asked_what_it_has_seen_is_named_with_its_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, downloaded: Path
+) -> None:
+    run = finished_run(tmp_path / "own", start="me/nobody")
+    method = MethodConfig("ours", factory="a.B", options={"weights": str(run.model)})
+    with pytest.raises(InputError, match=r"extrapolation_model\.json: start=me/nobody"):
+        trained_models([method], ["cup"])
 
 
 def test_a_table_compares_a_repository(downloaded: Path) -> None:
