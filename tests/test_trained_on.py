@@ -82,7 +82,7 @@ def test_other_weights_to_start_from_are_a_difference(
     begun: Manifest, tmp_path: Path, is_folder: bool
 ) -> None:
     start = tmp_path / "start"
-    weights = start / "unet" / "weights" if is_folder else start
+    weights = start / "unet" / "weights.bin" if is_folder else start
     weights.parent.mkdir(exist_ok=True, parents=True)
     weights.write_bytes(b"one")
     config = replace(_CONFIG, model=replace(_CONFIG.model, start=str(start)))
