@@ -35,7 +35,7 @@ PREDICTED_CONFIDENCE = 0.7
 CONTRADICTED = 0.9
 """Factor on the confidence of a pixel whose two depths differ."""
 AS_SURE = 1e-3
-"""Confidences that differ by less are equal: warping one rounds it."""
+"""Confidences that differ by less count as equal, since warping rounds them."""
 
 
 @dataclass(frozen=True)
@@ -189,12 +189,12 @@ def _seen_through(
     confidence: Float[Tensor, "h w"],
     camera: Camera,
 ) -> Bool[Tensor, "h w"]:
-    """Pixels whose point lies in front of what a surer view has seen behind it."""
+    """Pixels whose point lies in front of what a more certain view has seen behind it."""
     points = unproject_to_world(depth, camera).flatten(0, 1)
     found = torch.zeros(len(points), dtype=torch.bool)
     for index in known.nearest(camera, MOST_COMPARED):
         other = known.views[index]
         said = look_up(points, other.depth, other.camera, 2 * known.tolerance)
-        surer = other.confidence.flatten()[said.pixel] > confidence.flatten() + AS_SURE
-        found |= (said.sight == Sight.IN_FRONT) & surer
+        more_certain = other.confidence.flatten()[said.pixel] > confidence.flatten() + AS_SURE
+        found |= (said.sight == Sight.IN_FRONT) & more_certain
     return found.view_as(depth) & (depth > 0)

@@ -34,9 +34,9 @@ MOST_INPUTS = 6
 STEP_DEG = (22.0, 40.0)
 """Between neighbouring views of the orbit."""
 LARGEST_ERROR = 0.04
-"""Of the depths that views enter the map with, relative, one standard deviation."""
+"""Relative error of the depths that views enter the map with: one standard deviation, at most."""
 _KNOTS = 5
-"""Of the smooth error field of a depth map, along each side."""
+"""Knots of the smooth error field of a depth map, along each side."""
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ class DepthMixture:
     log_shares: Float[Tensor, "b 2 h w"]
 
     def negative_log_likelihood(self, log_depth: Float[Tensor, "b h w"]) -> Float[Tensor, "b h w"]:
-        """Of the true log depth, per pixel."""
+        """Negative log-likelihood of the true log depth, per pixel."""
         off = (log_depth[:, None] - self.modes).abs() / self.spreads
         return -torch.logsumexp(self.log_shares - (2 * self.spreads).log() - off, 1)
 
