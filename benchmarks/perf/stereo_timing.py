@@ -1,4 +1,4 @@
-"""The dear parts of plane-sweep stereo, against their definitions in plain torch."""
+"""The expensive parts of plane-sweep stereo, against their definitions in plain torch."""
 
 import torch
 

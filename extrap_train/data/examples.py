@@ -198,7 +198,7 @@ class ExampleReader:
         """The pair's example with up to `count` references; those after the first are drawn."""
         data, pair = self._pairs[index]
         is_corrected = self._split == "train" and data.is_corrected
-        # The query may be seen from frames whose correction is known, where there is one.
+        # With correction, only frames whose correction for this query is known can be references.
         candidates = (
             data.partners(pair.sequence, pair.query)
             if is_corrected

@@ -1,4 +1,4 @@
-"""The plane sweep's two dear parts on the CPU: the matching cost and its semi-global sums."""
+"""Expensive parts of a plane sweep, on the CPU: the matching cost and its semi-global sums."""
 
 import numba
 import numpy as np
@@ -16,7 +16,10 @@ def correlation_cost_numba(
     """Fill `cost` (planes × height × width) with (1 − NCC) / 2 of a view's windows and those of one
     other view at the hypothetical depths; infinite where the other view does not see the point.
 
-    `image`, `mean` and `other` have the channel last; `rules` are half the window and the noise.
+    `inverse_depth` is planes × height × width, per scene unit. `at_infinity` (height × width × 3)
+    and `epipole` (3) are those of `photo_cost.Projection`. `image`, its windows' `mean` (both
+    height × width × 3) and `other` are colours from 0 to 1; `variance` (height × width) is summed
+    over the colours. `rules` are half the window's side in pixels and the noise.
     """
     half, noise = rules
     planes, height, width = inverse_depth.shape

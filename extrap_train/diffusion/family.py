@@ -31,10 +31,10 @@ from extrap_train.views import PairBatch, Warp
 
 
 class Family:
-    """One family; as it stands, `zeronvs` (Sargent et al. 2024), which is told the pose alone: the
-    network has to imagine the query from the reference.
+    """A family of models. This class is `zeronvs` (Sargent et al. 2024), which is conditioned on
+    the reference and the pose, not on the warp; the others override what differs.
 
-    The batch that it is given must hold its warp.
+    Batches must hold their warp.
     """
 
     def channels(self, latent_channels: int, config: ModelConfig) -> int:

@@ -155,7 +155,7 @@ def _train(training: DepthTraining, examples: StoredExamples, checkpoint: Path) 
 def _print_scores(scores: DepthScores, folder: Path, console: Console) -> None:
     console.print(
         f"held-out captures, object pixels that no reference shows for certain: median error "
-        f"{scores.median_error:.1%}, {scores.within:.0%} within 2 %; {scores.said:.0%} have a "
-        f"confidence of at least 50 %, of which {scores.said_and_within:.0%} are within 2 %\n"
+        f"{scores.median_error:.1%}, {scores.within:.0%} within 2 %; {scores.confident:.0%} have a "
+        f"confidence of at least 50 %, of which {scores.confident_and_within:.0%} are within 2 %\n"
         f"result: {folder}"
     )

@@ -130,5 +130,5 @@ def _model_folder(config: TrainConfig) -> Path:
 
 
 def _name(folder: Path) -> str:
-    """A packaged model's own, whose length of training is known by it."""
+    """A packaged model's name, by which its training length is looked up; else the path."""
     return folder.name if folder.parent == PACKAGED_MODELS else str(folder)

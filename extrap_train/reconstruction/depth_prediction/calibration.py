@@ -22,23 +22,23 @@ _ON_OBJECT = 4.0
 
 @dataclass(frozen=True)
 class DepthScores:
-    """Over the object's pixels that no reference shows for certain."""
+    """Depth errors over the object's pixels that no reference shows for certain."""
 
     median_error: float
-    """Relative."""
+    """Median relative error of depth."""
     within: float
     """Share of the pixels within `CONFIDENT_WITHIN`."""
-    said: float
-    """Share of the pixels whose confidence is at least a half."""
-    said_and_within: float
-    """Share of those that are within `CONFIDENT_WITHIN`."""
+    confident: float
+    """Share of the pixels whose confidence is .5 or more."""
+    confident_and_within: float
+    """Share of the confident pixels within `CONFIDENT_WITHIN`."""
     calibration_error: float
     """Mean absolute difference of confidence and share within, over bins of confidence."""
 
 
 @torch.inference_mode()
 def calibrate(network: DepthNetwork, batches: Iterable[Float[Tensor, "b c h w"]]) -> DepthScores:
-    """Set the factor on all spreads that makes the confidence truest; returns the scores with it.
+    """Set the factor on all spreads that calibrates the confidence best; return the scores.
 
     `batches` are stored examples, as `network_training.StoredExamples.captures` gives them, of
     captures that the network was not trained on.
@@ -73,12 +73,12 @@ def _score(mixture: DepthMixture, truth: Float[Tensor, "1 1 n"]) -> DepthScores:
     log_depth, confidence = mixture.best()
     error = ((log_depth - truth).exp() - 1).abs().flatten()
     confidence = confidence.flatten()
-    within, said = error <= CONFIDENT_WITHIN, confidence >= 0.5
+    within, is_confident = error <= CONFIDENT_WITHIN, confidence >= 0.5
     return DepthScores(
         float(error.median()),
         float(within.float().mean()),
-        float(said.float().mean()),
-        float(within[said].float().mean()),
+        float(is_confident.float().mean()),
+        float(within[is_confident].float().mean()),
         _calibration_error(confidence, within),
     )
 

@@ -31,8 +31,9 @@ Truth = Callable[[Camera], tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]]
 LEAST_FRAMES = 12
 """Frames that a capture needs, so that neighbouring photographs stand at most 30° apart."""
 MOST_INPUTS = 6
+"""Most photographs that a capture is completed from; the fewest are three."""
 STEP_DEG = (22.0, 40.0)
-"""Between neighbouring views of the orbit."""
+"""Range of the angle between neighbouring views of the orbit."""
 LARGEST_ERROR = 0.04
 """Relative error of the depths that views enter the map with: one standard deviation, at most."""
 _KNOTS = 5
@@ -102,7 +103,7 @@ class _Recorder:
         depth = depth / self.world.unit
         self.examples.append(with_truth(seen, depth, mask))
         error = self.error * _smooth_field(depth.shape, self.rng)
-        confidence = (1 - error.abs() / 0.04).clamp(0.1, 0.9)
+        confidence = (1 - error.abs() / LARGEST_ERROR).clamp(0.1, 0.9)
         certain = seen.certain[0]
         spoiled = depth * (1 + torch.where(certain, 0, error))
         completed = PredictedDepth(spoiled, confidence, certain)
