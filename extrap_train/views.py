@@ -225,6 +225,8 @@ class PairBatch:
     reference_flows: Float[Tensor, "b k 2 g g"] | None = None
     """Where each reference's warp really belongs (`geometry.spline_flow`); None leaves all where
     they are."""
+    object_mask: Bool[Tensor, "b h w"] | None = None
+    """Where the target view shows the object; None where that is not known."""
     warp: Warp | None = None
     """Made by `geometry.warp.compute_warp` once the batch is on its device; None until then."""
 
@@ -245,6 +247,7 @@ class PackedBatch:
     depth_unit: Float[Tensor, " b"]
     reference_valid: Bool[Tensor, "b k"]
     reference_flows: Float[Tensor, "b k 2 g g"] | None = None
+    object_mask: Bool[Tensor, "b h w"] | None = None
 
     def to(self, device: torch.device | str) -> "PackedBatch":
         """The same batch on another device, which pinned memory reaches while others compute."""
@@ -264,6 +267,7 @@ class PackedBatch:
             reference_depths=self.reference_depths.float() * self.depth_unit[:, None, None, None],
             reference_valid=self.reference_valid,
             reference_flows=self.reference_flows,
+            object_mask=self.object_mask,
         )
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from extrap_train.data.camera_check import is_degenerate
@@ -42,6 +42,8 @@ class Example:
     reference_depths: Float[Tensor, "k h w"]
     reference_flows: Float[Tensor, "k 2 g g"] | None = None
     depth_unit: float = 1.0
+    object_mask: Bool[Tensor, "h w"] | None = None
+    """Where the query shows the object; known in held-out examples only."""
 
 
 def mirror(example: Example) -> Example:
@@ -55,6 +57,7 @@ def mirror(example: Example) -> Example:
         reference_cameras=_mirror_camera(example.reference_cameras),
         reference_depths=example.reference_depths.flip(-1),
         reference_flows=None if flows is None else flows.flip(-1) * flip,
+        object_mask=None if example.object_mask is None else example.object_mask.flip(-1),
     )
 
 
@@ -85,6 +88,7 @@ def _stack(examples: Sequence[Example], references: int) -> dict[str, Any]:
     ]
     valid = [[i < len(e.reference_images) for i in range(references)] for e in examples]
     pairs = list(zip(examples, orders, strict=True))
+    masks = [e.object_mask for e in examples if e.object_mask is not None]
     return {
         "image": torch.stack([e.image for e in examples]),
         "camera": stack_cameras([e.camera for e in examples]),
@@ -95,6 +99,7 @@ def _stack(examples: Sequence[Example], references: int) -> dict[str, Any]:
         "reference_depths": _gather([e.reference_depths for e in examples], orders),
         "reference_valid": torch.tensor(valid),
         "reference_flows": _flows([(e.reference_flows, o) for e, o in pairs]),
+        "object_mask": torch.stack(masks) if len(masks) == len(examples) else None,
     }
 
 
@@ -206,7 +211,10 @@ class ExampleReader:
         )
         first, angles = pair.references[0], self._angles_of(data, pair.sequence)
         further = extra_references(angles, pair.query, first, count, rng, candidates)
-        return read_example(data, replace(pair, references=(first, *further)), is_corrected)
+        example = read_example(data, replace(pair, references=(first, *further)), is_corrected)
+        if self._split == "train":
+            return example
+        return replace(example, object_mask=data.mask(pair.sequence, pair.query))
 
     def pack(self, examples: list[Example]) -> PackedBatch:
         """A batch with room for the reader's number of references."""

@@ -1,11 +1,11 @@
-"""How one stored frame becomes bytes: its photograph as JPEG or PNG, its depth map without loss."""
+"""How one stored frame becomes bytes: its photograph as JPEG or PNG, the rest without loss."""
 
 import io
 
 import cv2
 import numpy as np
 import pyarrow as pa
-from jaxtyping import Float16, UInt8, UInt16
+from jaxtyping import Bool, Float16, UInt8, UInt16
 from PIL import Image, UnidentifiedImageError
 
 from extrap_train.geometry.compiled import compiled
@@ -52,14 +52,32 @@ def encode_depth(depth: Float16[np.ndarray, "h w"]) -> bytes:
 
 def decode_depth(content: UInt8[np.ndarray, " n"], side: int) -> Float16[np.ndarray, "h w"]:
     """The depth map, of side × side pixels; ValueError where it is none of that size."""
+    buffer = _decompress(content, 2 * side * side, f"depth map of {side} x {side} pixels")
+    planes = np.frombuffer(buffer, np.uint8).reshape(2, side, side)
+    return _row_sums(planes).view(np.float16)
+
+
+def encode_mask(mask: Bool[np.ndarray, "h w"]) -> bytes:
+    """The object's mask, a bit a pixel, compressed."""
+    return _ZSTD.compress(np.packbits(mask).data, True)
+
+
+def decode_mask(content: UInt8[np.ndarray, " n"], side: int) -> Bool[np.ndarray, "h w"]:
+    """The object's mask, of side × side pixels; ValueError where it is none of that size."""
+    size = -(-side * side // 8)
+    bits = np.frombuffer(_decompress(content, size, f"mask of {side} x {side} pixels"), np.uint8)
+    return np.unpackbits(bits, count=side * side).reshape(side, side).astype(bool)
+
+
+def _decompress(content: UInt8[np.ndarray, " n"], size: int, what: str) -> pa.Buffer:
+    """The `size` bytes that were compressed; ValueError where it is not `what`."""
     try:
-        buffer = _ZSTD.decompress(pa.py_buffer(content), 2 * side * side)
+        buffer = _ZSTD.decompress(pa.py_buffer(content), size)
     except (OSError, pa.ArrowException) as error:
-        raise ValueError(f"no depth map of {side} x {side} pixels ({error})") from None
-    planes = np.frombuffer(buffer, np.uint8)
-    if planes.size != 2 * side * side:
-        raise ValueError(f"no depth map of {side} x {side} pixels")
-    return _row_sums(planes.reshape(2, side, side)).view(np.float16)
+        raise ValueError(f"no {what} ({error})") from None
+    if buffer.size != size:
+        raise ValueError(f"no {what}")
+    return buffer
 
 
 @compiled()

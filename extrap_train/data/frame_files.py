@@ -14,10 +14,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
-from jaxtyping import Float, Float16, Shaped, UInt8
+from jaxtyping import Bool, Float, Float16, Shaped, UInt8
 from torch import Tensor
 
-from extrap_train.data.frame_codec import decode_depth, decode_image, encode_depth, encode_image
+from extrap_train.data.frame_codec import (
+    decode_depth,
+    decode_image,
+    decode_mask,
+    encode_depth,
+    encode_image,
+    encode_mask,
+)
 from extrap_train.data.paths import file_stamp
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import atomic_folder, save_array
@@ -30,7 +37,7 @@ FLOWS = "flows.npy"
 FRAMES, CAMERAS = "frames.npy", "frames.parquet"
 """A sequence's encoded frames (`frame_codec`), one after the other, and their table."""
 REMEDY = "run data_prep again, which makes what is damaged once more"
-_PARTS = ("image", "depth")
+_PARTS = ("image", "depth", "mask")
 _SEAL = ".seal"
 _SAFE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}")
 
@@ -44,8 +51,7 @@ class SequenceFrames:
     images: UInt8[np.ndarray, "n h w 3"]
     depths: Float[np.ndarray, "n h w"]
     masks: UInt8[np.ndarray, "n h w"]
-    """255 is the object; 255 everywhere where the capture has no mask. Not stored: they have placed
-    the square, and training reads none."""
+    """255 is the object; 255 everywhere where the capture has no mask."""
 
 
 class StoredFrames:
@@ -89,6 +95,10 @@ class StoredFrames:
     def depth(self, index: int) -> Float16[Tensor, "h w"]:
         """The depth map in the sequence's unit; 0 is unknown."""
         return torch.from_numpy(self._decode(index, 1, decode_depth))
+
+    def mask(self, index: int) -> Bool[Tensor, "h w"]:
+        """Where the frame shows the object; everywhere where the capture has no mask."""
+        return torch.from_numpy(self._decode(index, 2, decode_mask))
 
     def view(self, index: int) -> View:
         """A frame with its depth in scene units; 0 is unknown."""
@@ -163,13 +173,17 @@ def write_frames(place: "SealedTable", frames: SequenceFrames) -> None:
     scaled = frames.depths / scale
     scaled[scaled > np.finfo(np.float16).max] = 0
     depths = scaled.astype(np.float16)
-    parts = [[encode_image(x) for x in frames.images], [encode_depth(x) for x in depths]]
+    parts = [
+        [encode_image(x) for x in frames.images],
+        [encode_depth(x) for x in depths],
+        [encode_mask(x >= 128) for x in frames.masks],
+    ]
     table = _camera_table(frames, scale)
     for part, contents in zip(_PARTS, parts, strict=True):
         sizes, sums = [len(x) for x in contents], [zlib.crc32(x) for x in contents]
         table = table.append_column(f"{part}_bytes", pa.array(sizes, pa.int32()))
         table = table.append_column(f"{part}_crc32", pa.array(sums, pa.uint32()))
-    content = b"".join(image + depth for image, depth in zip(*parts, strict=True))
+    content = b"".join(b"".join(frame) for frame in zip(*parts, strict=True))
     place.write(table, {FRAMES: np.frombuffer(content, np.uint8)})
 
 

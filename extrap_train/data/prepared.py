@@ -24,7 +24,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
-from jaxtyping import Float, Float16, Int, UInt8
+from jaxtyping import Bool, Float, Float16, Int, UInt8
 from torch import Tensor
 
 from extrap_train.data.frame_files import (
@@ -42,7 +42,7 @@ from extrap_train.errors import InputError
 from extrap_train.store.records import read_record
 from extrap_train.views import Camera, ViewPair
 
-FORMAT = 5
+FORMAT = 6
 UNTOUCHED = -1
 """Flow number of a pair without a flow: its warp stays as it is."""
 _REPEATED = ("sequence", "split", "uncorrected")
@@ -195,6 +195,10 @@ class PreparedData:
         """Depth of some frames in units of `depth_unit`; 0 is unknown."""
         archive = self._archive(sequence)
         return torch.stack([archive.depth(index) for index in indices])
+
+    def mask(self, sequence: str, index: int) -> Bool[Tensor, "h w"]:
+        """Where a frame shows the object; everywhere where the capture has no mask."""
+        return self._archive(sequence).mask(index)
 
     def depth_unit(self, sequence: str) -> float:
         """A sequence's unit of depth in scene units, a power of two."""

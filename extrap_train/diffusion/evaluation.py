@@ -1,6 +1,6 @@
 """Scores of a model and of the baselines on the same held-out examples."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import pandas as pd
@@ -49,26 +49,34 @@ def predict(
 
 def score(prediction: Prediction, lpips: Distance | None) -> pd.DataFrame:
     """A row per view and method of a batch, see `score_images`."""
-    assert prediction.batch.warp is not None
-    known = prediction.batch.warp.mask
-    return score_images(prediction.images, prediction.batch.image, known, prediction.names, lpips)
+    batch = prediction.batch
+    assert batch.warp is not None
+    assert batch.object_mask is not None
+    known, shown = batch.warp.mask, batch.object_mask.to(batch.image.dtype)
+    return score_images(prediction.images, batch.image, known, shown, prediction.names, lpips)
 
 
 def score_images(
     images: dict[str, Float[Tensor, "b 3 h w"]],
     truth: Float[Tensor, "b 3 h w"],
     known: Float[Tensor, "b h w"],
+    shown: Float[Tensor, "b h w"],
     names: list[str],
     lpips: Distance | None,
 ) -> pd.DataFrame:
-    """A row per view and method: psnr, psnr_holes, psnr_warped (dB), ssim, and lpips where it can
-    be had.
+    """A row per view and method: PSNR in dB over five regions, ssim, lpips and lpips_object.
 
     Images and truth go through 8 bits first. `known` is 1 where a reference reaches; `psnr_holes`
-    is over the other pixels, `psnr_warped` over these; NaN where a view has none, or where LPIPS
-    cannot be had.
+    is over the other pixels, `psnr_warped` over these. `shown` is 1 where the truth shows the
+    object; `psnr_object` is over these pixels, `psnr_object_holes` over those of them that no
+    reference reaches. `lpips_object` compares the object on black, as CO3D's benchmark does. A
+    score is NaN where a view has no such pixel, or where LPIPS cannot be had.
     """
     truth = quantised(truth)
+
+    object_only = shown[:, None]
+    has_object = shown.flatten(1).any(1).cpu()
+    unknown = torch.full((len(truth),), torch.nan)
     tables = []
     for method, image in images.items():
         made = quantised(image)
@@ -76,14 +84,26 @@ def score_images(
             "psnr": psnr(made, truth),
             "psnr_holes": psnr(made, truth, 1 - known),
             "psnr_warped": psnr(made, truth, known),
+            "psnr_object": psnr(made, truth, shown),
+            "psnr_object_holes": psnr(made, truth, shown * (1 - known)),
             "ssim": ssim(made, truth),
-            "lpips": torch.full((len(made),), torch.nan) if lpips is None else lpips(made, truth),
+            "lpips": unknown,
+            "lpips_object": unknown,
         }
+        if lpips is not None:
+            cut_out = lpips(made * object_only, truth * object_only).cpu()
+            columns["lpips"] = lpips(made, truth)
+            columns["lpips_object"] = torch.where(has_object, cut_out, unknown)
         table = pd.DataFrame(
             {name: values.cpu().double().numpy() for name, values in columns.items()}
         )
         tables.append(table.assign(method=method, view=names))
     return pd.concat(tables, ignore_index=True)
+
+
+def missing_scores(reasons: Mapping[str, str]) -> dict[str, str]:
+    """Why scores are missing, by their names, from why LPIPS cannot be had."""
+    return {**reasons, **({"lpips_object": reasons["lpips"]} if "lpips" in reasons else {})}
 
 
 def summarise(scores: pd.DataFrame) -> dict[str, dict[str, float]]:

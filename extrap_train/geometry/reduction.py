@@ -17,12 +17,13 @@ def reduce_batch(batch: PairBatch, factor: int) -> PairBatch:
     """The batch with everything in it, its warp too, at 1/`factor` of its size.
 
     Colours are averaged; depth, which has edges, is taken from one pixel in each block: the middle
-    one, or half a fine pixel off the middle where `factor` is even.
+    one, or half a fine pixel off the middle where `factor` is even. A block of which the object
+    covers half is the object's.
     """
     if factor == 1:
         return batch
     size = (batch.camera.height // factor, batch.camera.width // factor)
-    middle = factor // 2
+    middle, mask = factor // 2, batch.object_mask
     return replace(
         batch,
         image=functional.avg_pool2d(batch.image, factor),
@@ -32,6 +33,7 @@ def reduce_batch(batch: PairBatch, factor: int) -> PairBatch:
         ).unflatten(0, batch.reference_images.shape[:2]),
         reference_cameras=batch.reference_cameras.resized(*size),
         reference_depths=batch.reference_depths[..., middle::factor, middle::factor],
+        object_mask=None if mask is None else functional.avg_pool2d(mask.float(), factor) >= 0.5,
         warp=None if batch.warp is None else reduce_warp(batch.warp, factor),
     )
 

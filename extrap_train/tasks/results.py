@@ -12,7 +12,7 @@ from rich.table import Table
 
 from extrap_train.data.prepared import PreparedData
 from extrap_train.diffusion.callbacks import ABOVE_BASELINES
-from extrap_train.diffusion.evaluation import Prediction, summarise
+from extrap_train.diffusion.evaluation import Prediction, missing_scores, summarise
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.errors import InputError
 from extrap_train.figures import draw_contact_sheet, error_map, mark_holes, plot_curve
@@ -38,6 +38,7 @@ def write_results(
     number is none.
     """
     config, scores = measured.config, measured.scores()
+    missing = missing_scores(missing)
     _require_finite(scores, missing)
     validation = summarise(scores)
     missing = missing | _undefined(validation["model"], missing)
@@ -64,9 +65,13 @@ def print_places(folder: RunFolder, console: Console) -> None:
     console.print(f"pictures: {folder.samples / 'final.png'}\nresult: {folder.path}")
 
 
+_NO_OBJECT = "no held-out view shows the object"
 _WITHOUT_PIXELS = {
     "psnr_holes": "no held-out view has a pixel that no reference shows",
     "psnr_warped": "no held-out view has a pixel that a reference shows",
+    "psnr_object": _NO_OBJECT,
+    "psnr_object_holes": "no held-out view has a pixel of the object that no reference shows",
+    "lpips_object": _NO_OBJECT,
 }
 
 

@@ -17,7 +17,7 @@ from extrap_train.data.sequences import Frame, FrameSequence
 from extrap_train.data.square_frames import target_views
 from extrap_train.device import advise_on_adapting_memory, trainer_precision
 from extrap_train.diffusion.adaptation import Adaptation, adapt
-from extrap_train.diffusion.evaluation import score_images, summarise
+from extrap_train.diffusion.evaluation import missing_scores, score_images, summarise
 from extrap_train.diffusion.generator import GeneratedViews
 from extrap_train.diffusion.lora import (
     AdapterOrigin,
@@ -221,7 +221,9 @@ def _measure(
     truth = torch.stack([view.image for view in targets])
     images = {"model": before.images, "adapted": after.images}
     names = [view.name for view in targets]
-    scores = score_images(images, truth, after.warp.mask, names, distance)
+    whole = torch.ones_like(truth[0, 0])
+    shown = torch.stack([whole if view.mask is None else view.mask.round() for view in targets])
+    scores = score_images(images, truth, after.warp.mask, shown, names, distance)
     write_atomic(folder / "held_out.csv", scores.to_csv(index=False).encode())
     draw_contact_sheet(
         {
@@ -253,7 +255,9 @@ def _write(
         "pairs": pairs.counts(),
         "adaptation": asdict(done),
         "held_out": measured,
-        "missing": missing if measured else {"held_out": "every frame of the scene is an input"},
+        "missing": missing_scores(missing)
+        if measured
+        else {"held_out": "every frame of the scene is an input"},
     }
     write_summary(folder, summary)
 

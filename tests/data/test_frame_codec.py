@@ -13,8 +13,10 @@ from extrap_train.data.frame_codec import (
     LOSSY_FROM,
     decode_depth,
     decode_image,
+    decode_mask,
     encode_depth,
     encode_image,
+    encode_mask,
 )
 from extrap_train.data.image_files import to_eight_bits
 from extrap_train.data.square_frames import object_square
@@ -28,6 +30,7 @@ CONTENTS = {
     "another kind of picture": cv2.imencode(".bmp", np.zeros((16, 16, 3), np.uint8))[1].tobytes(),
     "a depth map of another size": encode_depth(np.zeros((8, 8), np.float16)),
     "a larger depth map": encode_depth(np.zeros((64, 64), np.float16)),
+    "a larger mask": encode_mask(np.zeros((99, 99), bool)),
 }
 
 
@@ -41,6 +44,12 @@ def test_any_depth_comes_back_to_the_bit(bits: np.ndarray) -> None:
     """Infinities and what is not a number among them."""
     depth = bits.view(np.float16)
     assert np.array_equal(decode_depth(_bytes(encode_depth(depth)), 5).view(np.uint16), bits)
+
+
+@given(mask=arrays(bool, (7, 7)))
+@settings(max_examples=50, deadline=None)
+def test_any_mask_comes_back(mask: np.ndarray) -> None:
+    assert np.array_equal(decode_mask(_bytes(encode_mask(mask)), 7), mask)
 
 
 @given(pixels=arrays(np.uint8, (9, 9, 3)))
@@ -61,7 +70,7 @@ def test_a_large_photograph_keeps_its_colours_and_their_order(side: int, seed: i
 
 
 @pytest.mark.parametrize("name", list(CONTENTS))
-@pytest.mark.parametrize("decode", [decode_image, decode_depth])
+@pytest.mark.parametrize("decode", [decode_image, decode_depth, decode_mask])
 def test_other_bytes_are_an_error(decode, name: str) -> None:
     with pytest.raises(ValueError, match=r"16 x 16|no photograph"):
         decode(_bytes(CONTENTS[name]), 16)

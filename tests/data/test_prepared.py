@@ -108,6 +108,18 @@ def test_depth_survives_in_any_unit(exponent: float, seed: int, tmp_path_factory
     assert SealedTable(place.file, "another key").read() is None
 
 
+def test_masks_come_back_where_the_object_covers_half_of_a_pixel(tmp_path: Path) -> None:
+    masks = np.random.default_rng(0).integers(0, 256, (2, 5, 5)).astype(np.uint8)
+    images, depths = np.zeros((2, 5, 5, 3), np.uint8), np.ones((2, 5, 5), np.float32)
+    place = SealedTable(tmp_path / "one" / "frames.parquet", "key")
+    write_frames(place, SequenceFrames(("x", "y"), ring(even(2)), images, depths, masks))
+    table = place.read()
+    assert table is not None
+    stored = StoredFrames(place.file.parent, table, 5)
+    for index, mask in enumerate(masks):
+        assert np.array_equal(stored.mask(index), mask >= 128)
+
+
 def test_no_flipped_bit_of_a_table_changes_its_cameras(tmp_path: Path) -> None:
     camera, blank = ring(even(4)), np.zeros((4, 4, 4), np.uint8)
     images, depths = np.stack([blank] * 3, -1), np.ones((4, 4, 4), np.float32)
@@ -237,9 +249,16 @@ def test_a_changed_byte_is_found_when_its_frame_is_read(folder: Path, place: flo
     at = 128 + int(place * (len(whole) - 128))
     file.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
     data = PreparedData.open(folder)
+
+    def read_all() -> None:
+        for index in range(24):
+            data.images("cup/d", [index])
+            data.depths("cup/d", [index])
+            data.mask("cup/d", index)
+
     try:
         with pytest.raises(InputError, match=r"frames\.npy is damaged .*frame \d+"):
-            _ = data.images("cup/d", range(24)), data.depths("cup/d", range(24))
+            read_all()
     finally:
         file.write_bytes(whole)
 

@@ -82,6 +82,14 @@ def wall(size: int) -> PairBatch:
     )
 
 
+def test_a_block_is_the_objects_where_it_covers_half() -> None:
+    mask = torch.zeros(1, 4, 4, dtype=torch.bool)
+    mask[0, 0, :2] = mask[0, 2, 2] = True  # two pixels of the first block, one of the last
+    reduced = reduce_batch(replace(wall(4), object_mask=mask), 2)
+    assert reduced.object_mask is not None
+    assert reduced.object_mask[0].tolist() == [[True, False], [False, False]]
+
+
 def test_the_reduced_cameras_see_the_same_rays() -> None:
     """The reduced wall's points are those of the blocks' middles."""
     whole, half = wall(16), reduce_batch(wall(16), 2)
