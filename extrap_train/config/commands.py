@@ -75,7 +75,10 @@ class TrainerConfig:
         low=1,
     )
     workers: int = option(
-        0, "processes that load batches besides the training process", low=0, high=1024
+        0,
+        "processes that load batches besides the training process, at most one per core",
+        low=0,
+        high=1024,
     )
 
 

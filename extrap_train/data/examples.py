@@ -1,7 +1,9 @@
 """A query view and its references: read from prepared data, or posed views and a new camera."""
 
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -182,26 +184,36 @@ class ExampleReader:
 
     def __init__(self, prepared: list[PreparedData], split: str, references: int) -> None:
         self.references = references
-        self._split = split
-        self._pairs = [(data, pair) for data in prepared for pair in data.pairs(split)]
+        self._prepared, self._split = prepared, split
+        self._pairs = [data.pairs(split) for data in prepared]
+        self._ends = [*accumulate(len(pairs) for pairs in self._pairs)]
         self._angles: dict[tuple[Path, str], np.ndarray] = {}
 
     def __len__(self) -> int:
-        return len(self._pairs)
+        return self._ends[-1]
+
+    def __reduce__(self) -> tuple[type["ExampleReader"], tuple[list[PreparedData], str, int]]:
+        """Another process opens the data itself, instead of being sent a million pairs."""
+        return ExampleReader, (self._prepared, self._split, self.references)
+
+    def _pair(self, index: int) -> tuple[PreparedData, ViewPair]:
+        member = bisect_right(self._ends, index)
+        first = self._ends[member - 1] if member else 0
+        return self._prepared[member], self._pairs[member][index - first]
 
     def name(self, index: int) -> str:
         """Unique name of a pair: folder, sequence, query and reference."""
-        data, pair = self._pairs[index]
+        data, pair = self._pair(index)
         return f"{data.folder.name}/{pair.sequence}/{pair.query}-{pair.references[0]}"
 
     def angle_rad(self, index: int) -> float:
         """Angle between the query and its nearest reference, seen from the scene's centre."""
-        data, pair = self._pairs[index]
+        data, pair = self._pair(index)
         return float(self._angles_of(data, pair.sequence)[pair.query, pair.references[0]])
 
     def read(self, index: int, count: int, rng: np.random.Generator) -> Example:
         """The pair's example with up to `count` references; those after the first are drawn."""
-        data, pair = self._pairs[index]
+        data, pair = self._pair(index)
         is_corrected = self._split == "train" and data.is_corrected
         # With correction, only frames whose correction for this query is known can be references.
         candidates = (

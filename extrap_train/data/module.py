@@ -1,5 +1,7 @@
 """Batches for training and validation, a pure function of the seed and of the step they are for."""
 
+import os
+import signal
 from collections.abc import Callable, Iterator
 
 import lightning
@@ -9,8 +11,10 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 from extrap_train.config import TrainConfig
 from extrap_train.data.examples import Example, ExampleReader, linspace_indices, mirror
 from extrap_train.geometry.warp import compute_warp
+from extrap_train.jobs.fork_server import start_fork_server
 from extrap_train.views import PackedBatch, PairBatch
 
+_PRELOAD = ("extrap_train.data.module",)
 Positions = list[tuple[int, int]]
 """(position in the endless stream of examples, index of the pair)."""
 
@@ -135,13 +139,18 @@ class PairModule(lightning.LightningDataModule):
     def _loader(
         self, dataset: Dataset[PackedBatch], sampler: Sampler[Positions] | list[int]
     ) -> DataLoader[PackedBatch]:
-        workers = self.config.trainer.workers
+        """Workers come from a server of their own: forked from this process, they would keep the
+        memory that its weights had at that moment.
+        """
+        workers = min(self.config.trainer.workers, len(os.sched_getaffinity(0)))
         device = self.trainer.strategy.root_device.type if self.trainer else "cpu"
         return DataLoader(
             dataset,
             batch_size=None,
             sampler=sampler,
             num_workers=workers,
+            multiprocessing_context=start_fork_server(_PRELOAD) if workers else None,
+            worker_init_fn=_ignore_interrupts,
             persistent_workers=workers > 0,
             pin_memory=device == "cuda",
         )
@@ -149,6 +158,11 @@ class PairModule(lightning.LightningDataModule):
     def on_after_batch_transfer(self, batch: PackedBatch, dataloader_idx: int) -> PairBatch:
         """Lightning's hook: warps are computed, not stored."""
         return compute_warp(batch.unpack(), self.config.model.image_size)
+
+
+def _ignore_interrupts(worker: int) -> None:
+    """Ctrl-C reaches every process of a terminal; the one that trains finishes its step first."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def shard(batches: int, rank: int, world: int) -> list[int]:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, cast
 
 import torch
 from lightning import LightningModule, Trainer
@@ -39,7 +39,21 @@ _PIECE_BYTES = 2**20
 
 
 class WholeCheckpointIO(TorchCheckpointIO):
-    """Writes a checkpoint complete or not at all."""
+    """Writes a checkpoint complete or not at all, and maps it to read it."""
+
+    def load_checkpoint(
+        self,
+        path: str | os.PathLike[str],
+        map_location: Any = "cpu",
+        weights_only: bool | None = True,
+    ) -> dict[str, Any]:
+        """Map the file, of which each page is read when it is used: weights and moments go from
+        there into the model's own memory, without a second copy beside them.
+
+        Nothing but tensors and plain values is made, whatever is asked for.
+        """
+        loaded = torch.load(path, map_location=map_location, weights_only=True, mmap=True)
+        return cast(dict[str, Any], loaded)
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: Any = None

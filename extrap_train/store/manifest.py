@@ -16,6 +16,7 @@ from typing import Any
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import atomic_folder, file_lock, link_target, remove_leftovers
 from extrap_train.store.records import read_record, write_record
+from extrap_train.terminal import terminal
 
 MANIFEST = "manifest.json"
 """The manifest's file in the folder of every result."""
@@ -178,7 +179,23 @@ def claim(
         remove_leftovers(place.parent, of=place.name if folder.is_symlink() else "")
         for part in (place, *(path for path in place.rglob("*") if path.is_dir())):
             remove_leftovers(part)
-        yield Claim(place, manifest, is_there and resume)
+        with _held(place.with_name(f".{place.name}.held"), folder):
+            yield Claim(place, manifest, is_there and resume)
+
+
+@contextmanager
+def _held(mark: Path, folder: Path) -> Iterator[None]:
+    """Leave a mark as long as the block lasts; one that is there was left by a killed process."""
+    if mark.exists():
+        terminal(stderr=True).print(
+            f"note: {folder}: the last command here was killed without a word, as by the system "
+            "where memory ends (smaller batches take less); what it finished is kept"
+        )
+    mark.touch()
+    try:
+        yield
+    finally:
+        mark.unlink(missing_ok=True)
 
 
 def require_same(folder: Path, manifest: Manifest, remedy: str = REMEDY) -> None:

@@ -33,6 +33,7 @@ from extrap_train.diffusion.checkpoints import (
     step_of,
     thin_checkpoints,
 )
+from extrap_train.diffusion.footprint import Footprint, require_room
 from extrap_train.diffusion.hub import pin_revision
 from extrap_train.diffusion.model import ExtrapolationModel, use_channels_last
 from extrap_train.diffusion.model_files import initial_model, save_model
@@ -82,6 +83,9 @@ def run(config: TrainConfig, prepare: Prepare) -> Outcome:
             steps = Finished.read(folder).steps
             console.print(f"already trained for {steps} steps: {folder.path}")
         else:
+            console.print(
+                require_room(Footprint.of(model, config.trainer), config.trainer, folder.path)
+            )
             training = CategoryTraining(model, config, data.validation_names(), distance)
             with open_logger(config, folder) as loggers:
                 _train(training, data, opening.checkpoint, folder, seconds, loggers)

@@ -1,13 +1,25 @@
 """Batches are a function of seed and position alone; a mirrored example is a consistent scene."""
 
+import pickle
 from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from orbits import capture, even, ring
+from prepared import prepared_captures
 
-from extrap_train.data.examples import Example, collate, linspace_indices, mirror, pack
+from extrap_train.data.examples import (
+    Example,
+    ExampleReader,
+    collate,
+    linspace_indices,
+    mirror,
+    pack,
+)
 from extrap_train.data.module import PositionSampler
 from extrap_train.geometry.warp import compute_warp
 from extrap_train.views import Camera, PairBatch
@@ -39,6 +51,22 @@ def test_ranks_share_the_stream_without_overlap() -> None:
     both = [list(rank) for rank in ranks]
     together = [batch for pair in zip(*both, strict=True) for batch in pair]
     assert together == list(whole)
+
+
+def test_a_reader_is_sent_to_workers_as_the_name_of_its_data(tmp_path: Path) -> None:
+    """Not as a million pairs; there it reads what it reads here."""
+    frames = [capture(ring(even(24)), name, depth=2.5) for name in ("a", "b", "c")]
+    folders = [tmp_path / name for name in ("one", "two")]
+    reader = ExampleReader([prepared_captures(x, frames, {"c"}) for x in folders], "train", 2)
+    sent = pickle.dumps(reader)
+    assert len(sent) < 1000
+    again = pickle.loads(sent)
+    assert len(again) == len(reader) > 0
+    for index in (0, len(reader) // 2 - 1, len(reader) // 2, len(reader) - 1):
+        assert again.name(index) == reader.name(index)
+        assert reader.name(index).startswith(folders[index >= len(reader) // 2].name)
+        read = [each.read(index, 2, np.random.default_rng(0)) for each in (reader, again)]
+        assert torch.equal(read[0].reference_images, read[1].reference_images)
 
 
 def test_spread_reaches_both_ends() -> None:

@@ -43,6 +43,25 @@ def test_a_checkpoint_comes_back_as_it_was_saved(saved: Path) -> None:
     assert torch.equal(loaded["state_dict"]["weight"], torch.arange(600.0))
 
 
+def test_a_checkpoint_is_read_where_it_is_used(tmp_path: Path) -> None:
+    """Loading one of 256 MB takes no memory for its tensors."""
+    path = tmp_path / "step-00000001.ckpt"
+    WholeCheckpointIO().save_checkpoint({"state_dict": {"weight": torch.ones(2**26)}}, path)
+    loaded = WholeCheckpointIO().load_checkpoint(path)
+    before = _private_kib()
+    assert float(loaded["state_dict"]["weight"][::4096].sum()) == 2**14
+    assert _private_kib() - before < 2**15
+    loaded["state_dict"]["weight"].zero_()
+    del loaded
+    assert torch.load(path, mmap=True)["state_dict"]["weight"][0] == 1, "the file stays as it was"
+
+
+def _private_kib() -> int:
+    """Memory of this process that no file stands for."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return int(next(line for line in lines if line.startswith("RssAnon")).split()[1])
+
+
 def test_no_flipped_bit_changes_what_is_loaded(saved: Path) -> None:
     """Either the file is refused, or the bit was one that means nothing."""
     content = saved.read_bytes()

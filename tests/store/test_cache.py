@@ -1,6 +1,8 @@
 """A result's folder is made, reused or refused, and belongs to one process at a time."""
 
 import multiprocessing
+import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -192,3 +194,24 @@ def test_a_folder_that_another_process_holds_is_refused(made: Path) -> None:
         claim(made, _ONE, resume=True),
     ):
         pass
+
+
+def _claim_and_be_killed(folder: Path) -> None:
+    with claim(folder, _ONE, resume=True):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_the_command_after_a_killed_one_says_so_once(
+    made: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    killed = multiprocessing.get_context("fork").Process(target=_claim_and_be_killed, args=[made])
+    killed.start()
+    killed.join()
+    said = []
+    for _ in range(2):
+        with claim(made, _ONE, resume=True):
+            said.append(capsys.readouterr().err)
+    assert str(made) in said[0]
+    assert "killed" in said[0]
+    assert not said[1]
+    assert (made / "picture").read_text() == "one"
