@@ -203,7 +203,7 @@ def test_killed_again_and_again_the_weights_are_the_same(
 
 def _link_data(source: Path, output: Path) -> None:
     """Let a job use the rendered and prepared data of another."""
-    for name in ("synthetic", "data"):
+    for name in ("synthetic", "data", "frames", "pairs"):
         (output / name).symlink_to(source / name)
 
 
@@ -241,3 +241,20 @@ def test_a_training_goes_on_with_changed_options_that_change_nothing_learnt(
     assert _run_folder(tmp_path) == first
     assert first.name == _run_folder(undisturbed).name
     assert _weights(tmp_path) == _weights(undisturbed)
+
+
+def test_what_a_run_starts_from_is_measured_once_on_the_same_views(
+    undisturbed: Path, tmp_path: Path
+) -> None:
+    _link_data(undisturbed, tmp_path)
+    start = f"model.start={_run_folder(undisturbed) / 'model'}"
+    trained = json.loads((_run_folder(undisturbed) / "summary.json").read_text())
+    for steps in (2, 3):  # the second goes on where the first ended
+        _finish(tmp_path, start, f"trainer.steps={steps}", "trainer.validate_every=3")
+        summary = json.loads((_run_folder(tmp_path) / "summary.json").read_text())
+        scores = summary["validation"]["start"]
+        assert scores["psnr"] == pytest.approx(trained["validation"]["model"]["psnr"], abs=1e-3)
+    _finish(tmp_path, start, "trainer.steps=3", "validation.examples=3")
+    summary = json.loads((_run_folder(tmp_path) / "summary.json").read_text())
+    assert "start" not in summary["validation"]
+    assert "start" in summary["missing"]

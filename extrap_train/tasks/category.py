@@ -53,7 +53,13 @@ from extrap_train.runs import (
 from extrap_train.store import Outcome
 from extrap_train.store.manifest import REMEDY, Conflict, Manifest, claim
 from extrap_train.tasks.loggers import log_sheet, open_logger, require_logger
-from extrap_train.tasks.results import draw_curve, draw_views, print_places, write_results
+from extrap_train.tasks.results import (
+    draw_curve,
+    draw_views,
+    keep_start_scores,
+    print_places,
+    write_results,
+)
 from extrap_train.tasks.training_data import Prepare, data_module, require_unseen
 from extrap_train.terminal import terminal
 
@@ -149,7 +155,10 @@ def _train(
     seconds: dict[str, float],
     loggers: list[Logger],
 ) -> None:
-    """Train and validate, and note how long both took."""
+    """Train and validate, and note how long both took.
+
+    What the run starts from is measured before its first step.
+    """
     started = time.perf_counter()
     every = data.batches_per_epoch
     kept = Checkpoints(folder.checkpoints, every)
@@ -160,6 +169,11 @@ def _train(
         restoring(checkpoint, lambda: kept.has_begun),
         advise_on_training_memory(training.config.trainer),
     ):
+        if checkpoint is None and training.config.model.start is not None:
+            trainer.validate(training, data, verbose=False)
+            if is_first():
+                keep_start_scores(training.scores(), folder)
+            started = time.perf_counter()
         trainer.fit(training, data, ckpt_path=checkpoint, weights_only=True)
         seconds["train"] = time.perf_counter() - started
         if training.validated_step != trainer.global_step:

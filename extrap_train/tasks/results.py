@@ -38,6 +38,11 @@ def write_results(
     number is none.
     """
     config, scores = measured.config, measured.scores()
+    if (start := _start_scores(folder)) is not None:
+        if set(start["view"]) == set(scores["view"]):
+            scores = pd.concat([scores, start], ignore_index=True)
+        else:
+            missing = missing | {"start": "was measured on other held-out views"}
     missing = missing_scores(missing)
     _require_finite(scores, missing)
     validation = summarise(scores)
@@ -60,12 +65,32 @@ def write_results(
         console.print(f"missing {name}: {reason}")
 
 
+def keep_start_scores(scores: pd.DataFrame, folder: RunFolder) -> None:
+    """Keep how the model of a run scores before its first step, for `write_results`."""
+    start = scores[scores["method"] == "model"].assign(method="start")
+    write_atomic(folder.path / _START, start.to_csv(index=False).encode())
+
+
+def _start_scores(folder: RunFolder) -> pd.DataFrame | None:
+    """What `keep_start_scores` kept; None of a run from random weights."""
+    file = folder.path / _START
+    if not file.is_file():
+        return None
+    try:
+        table = pd.read_csv(file)
+        table["view"], table["method"]
+    except (ValueError, KeyError) as error:
+        raise InputError(f"{file}: damaged ({error}); delete it to go on without it") from None
+    return table
+
+
 def print_places(folder: RunFolder, console: Console) -> None:
     """Say where `write_results` has left what it made."""
     console.print(f"pictures: {folder.samples / 'final.png'}\nresult: {folder.path}")
 
 
 _NO_OBJECT = "no held-out view shows the object"
+_START = "start.csv"
 _WITHOUT_PIXELS = {
     "psnr_holes": "no held-out view has a pixel that no reference shows",
     "psnr_warped": "no held-out view has a pixel that a reference shows",
