@@ -61,8 +61,9 @@ def write_results(
     }
     write_summary(folder.path, summary)
     console.print(_table(validation))
-    for name, reason in missing.items():
-        console.print(f"missing {name}: {reason}")
+    for reason in dict.fromkeys(missing.values()):
+        names = ", ".join(name for name in missing if missing[name] == reason)
+        console.print(f"missing {names}: {reason}")
 
 
 def keep_start_scores(scores: pd.DataFrame, folder: RunFolder) -> None:
@@ -151,8 +152,11 @@ def draw_curve(folder: RunFolder) -> None:
 
 
 def _table(validation: dict[str, dict[str, float]]) -> Table:
-    metrics = list(next(iter(validation.values())))
-    table = Table("", *metrics, title="held-out views")
+    metrics = [name for name, mean in validation["model"].items() if math.isfinite(mean)]
+    table = Table(title="held-out views")
+    table.add_column(no_wrap=True)
+    for metric in metrics:
+        table.add_column(metric.replace("_", " "))
     for method, row in validation.items():
         table.add_row(method, *(f"{row[metric]:.3f}" for metric in metrics))
     return table
