@@ -5,7 +5,7 @@ import json
 import numpy as np
 from PIL import Image
 
-from extrap_train.geometry.opengl import opengl_from_world_to_cam
+from extrap_train.geometry.foreign_cameras import opengl_from_world_to_cam
 
 
 def write_transforms(folder, views, **common):

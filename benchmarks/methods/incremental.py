@@ -13,7 +13,7 @@ from extrap_train.config import CompletionConfig, StereoConfig
 from extrap_train.depth.sources import depth_source
 from extrap_train.diffusion.generator import GeneratedViews, ViewGenerator
 from extrap_train.diffusion.model import ExtrapolationModel
-from extrap_train.geometry.world_frame import WorldFrame
+from extrap_train.geometry.cameras import WorldFrame
 from extrap_train.reconstruction.cloud import cloud_of
 from extrap_train.reconstruction.completion import CompletionPipeline, Step, complete, map_of_inputs
 from extrap_train.reconstruction.fusion import fuse_depths

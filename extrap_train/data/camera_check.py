@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from extrap_train.errors import InputError
-from extrap_train.geometry.opengl import (
+from extrap_train.geometry.foreign_cameras import (
     flip_up_and_forward,
     opengl_from_world_to_cam,
     rigid_inverse,

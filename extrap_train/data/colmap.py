@@ -26,7 +26,7 @@ from extrap_train.data.listed_photographs import (
 from extrap_train.data.paths import MAX_PATH_BYTES, check_relative
 from extrap_train.data.sequences import FrameSequence, PointFile
 from extrap_train.errors import InputError
-from extrap_train.geometry.colmap import (
+from extrap_train.geometry.foreign_cameras import (
     CAMERA_MODELS,
     NAMES_AND_COUNTS,
     lens_from_parameters,

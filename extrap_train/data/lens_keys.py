@@ -9,7 +9,7 @@ import json
 import math
 from typing import Any
 
-from extrap_train.geometry.colmap import CAMERA_MODELS, lens_from_parameters
+from extrap_train.geometry.foreign_cameras import CAMERA_MODELS, lens_from_parameters
 from extrap_train.geometry.lens import Lens
 
 PERSPECTIVE = "PERSPECTIVE"

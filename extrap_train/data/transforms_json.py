@@ -24,7 +24,7 @@ from extrap_train.data.listed_photographs import (
 from extrap_train.data.paths import check_relative
 from extrap_train.data.sequences import FrameSequence, PointFile
 from extrap_train.errors import InputError
-from extrap_train.geometry.opengl import world_to_cam_from_opengl
+from extrap_train.geometry.foreign_cameras import world_to_cam_from_opengl
 from extrap_train.views import Camera, stack_cameras
 
 TRANSFORMS = "transforms.json"

@@ -6,6 +6,7 @@ them, all at the latents' resolution, and one cross-attention token from the ref
 and the relative pose. `family` has the other families.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -14,8 +15,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from extrap_train.diffusion.encoders import Autoencoder
-from extrap_train.geometry.encoding import coordinate_grid, positional_encoding
-from extrap_train.geometry.fill import fill_holes
+from extrap_train.geometry.cameras import coordinate_grid
+from extrap_train.geometry.resample import fill_holes
 from extrap_train.views import PairBatch, Warp, combine, send
 
 
@@ -134,3 +135,17 @@ def _encode_warped(warp: Warp, octaves: int, factor: int) -> Float[Tensor, "b c 
     share = functional.avg_pool2d(known, factor)
     coordinates = functional.avg_pool2d(warp.coordinates * known, factor) / share.clamp_min(1e-6)
     return positional_encoding(coordinates, octaves) * (share > 0)
+
+
+def positional_encoding(
+    coordinates: Float[Tensor, "b 2 h w"], octaves: int
+) -> Float[Tensor, "b {4*octaves} h w"]:
+    """Encode normalised (u, v) with frequencies π, 2π, 4π, …
+
+    Channels go by octave, and within one: sin u, sin v, cos u, cos v. At the lowest frequency
+    [−1, 1] is one period.
+    """
+    b, _, h, w = coordinates.shape
+    frequencies = math.pi * 2.0 ** torch.arange(octaves, device=coordinates.device)
+    angle_rad = coordinates[:, None] * frequencies[:, None, None, None].to(coordinates.dtype)
+    return torch.cat([angle_rad.sin(), angle_rad.cos()], 2).reshape(b, 4 * octaves, h, w)

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrap_train.geometry.opengl import opengl_from_world_to_cam
+from extrap_train.geometry.foreign_cameras import opengl_from_world_to_cam
 from extrap_train.views import Camera
 
 POSE_CHANNELS = 19

@@ -11,7 +11,7 @@ import torch
 from extrap_train.depth import DepthMap, DepthSource
 from extrap_train.depth.neighbours import convergence_point
 from extrap_train.errors import InputError
-from extrap_train.geometry.world_frame import WorldFrame
+from extrap_train.geometry.cameras import WorldFrame
 from extrap_train.views import Camera, View
 
 _SAME_PLACE = 1e-6

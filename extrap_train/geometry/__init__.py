@@ -21,7 +21,7 @@ Angles
 Batches
     leading dimensions; tensors are `b c h w`, several references of one query `b k c h w`.
 
-Foreign conventions are converted at the door, each in one file: `pytorch3d.py` (CO3D: row vectors,
-+X left, +Y up, both NDC formats), `opengl.py` (nerfstudio, ZeroNVS: +Y up, −Z forward), `colmap.py`
-(quaternions, camera models).
+Foreign conventions are converted at the door, by `foreign_cameras.py` alone: PyTorch3D's (CO3D: row
+vectors, +X left, +Y up, both NDC formats), OpenGL's (nerfstudio, ZeroNVS: +Y up, −Z forward) and
+COLMAP's (quaternions, camera models).
 """

@@ -1,11 +1,13 @@
-"""Projection between pixels and space."""
+"""Pixels, points and worlds: projection both ways, and a world centred on the scene."""
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-
 from extrap_train.views import Camera
-
+from dataclasses import dataclass, replace
+from jaxtyping import Float
+from torch import Tensor
+from extrap_train.views import Camera, View
 
 def pixel_grid(
     height: int, width: int, device: torch.device | str = "cpu"
@@ -17,6 +19,14 @@ def pixel_grid(
         indexing="ij",
     )
     return torch.stack([u, v], -1)
+
+
+def coordinate_grid(
+    height: int, width: int, device: torch.device | str = "cpu"
+) -> Float[Tensor, "2 h w"]:
+    """Normalised (u, v) of every pixel centre of an image, in (−1, 1)."""
+    size = torch.tensor([width, height], device=device)
+    return (pixel_grid(height, width, device) / size * 2 - 1).permute(2, 0, 1)
 
 
 def unproject(depth: Float[Tensor, "*b h w"], camera: Camera) -> Float[Tensor, "*b h w 3"]:
@@ -51,3 +61,45 @@ def project(
     u = k[..., 0, 0, None] * cam[..., 0] / safe + k[..., 0, 2, None]
     v = k[..., 1, 1, None] * cam[..., 1] / safe + k[..., 1, 2, None]
     return torch.stack([u, v], -1), depth
+
+
+@dataclass(frozen=True)
+class WorldFrame:
+    """A normalised world, centred on the scene: `x_outside = unit · x_inside + center`.
+
+    Thresholds mean the same in it whatever unit and origin the photographs' poses have. Computed in
+    double precision.
+    """
+
+    center: Float[Tensor, "3"]
+    """In the photographs' world."""
+    unit: float
+    """Length of 1 of the frame, in the photographs' world."""
+
+    def inside(self, camera: Camera) -> Camera:
+        """A camera (or batch) of the photographs' world in the frame."""
+        matrix, center = camera.world_to_cam.double(), self.center.to(camera.world_to_cam.device)
+        shift = matrix[..., :3, :3] @ center.double() + matrix[..., :3, 3]
+        return _with_translation(camera, shift / self.unit)
+
+    def outside(self, camera: Camera) -> Camera:
+        """A camera (or batch) of the frame in the photographs' world."""
+        matrix, center = camera.world_to_cam.double(), self.center.to(camera.world_to_cam.device)
+        shift = matrix[..., :3, 3] * self.unit - matrix[..., :3, :3] @ center.double()
+        return _with_translation(camera, shift)
+
+    def view_inside(self, view: View) -> View:
+        """A posed photograph in the frame, its depth with it."""
+        depth = None if view.depth is None else view.depth / self.unit
+        return replace(view, camera=self.inside(view.camera), depth=depth)
+
+    def points_outside(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Points of the frame in the photographs' world."""
+        center = self.center.to(points.device).double()
+        return (points.double() * self.unit + center).to(points.dtype)
+
+
+def _with_translation(camera: Camera, translation: Float[Tensor, "*b 3"]) -> Camera:
+    matrix = camera.world_to_cam.clone()
+    matrix[..., :3, 3] = translation.to(matrix.dtype)
+    return replace(camera, world_to_cam=matrix)

@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from extrap_train.config import FlowMatcherConfig
 from extrap_train.geometry.cameras import pixel_grid
-from extrap_train.geometry.fill import fill_holes
+from extrap_train.geometry.resample import fill_holes
 from extrap_train.geometry.ncc import windowed_correlation
 from extrap_train.geometry.resample import sample_pixels
 from extrap_train.matching import DenseFlow, Matches, resize, to_grey

@@ -20,7 +20,7 @@ from extrap_train.geometry.viewpoints import (
     pairwise_angles,
     scene_center,
 )
-from extrap_train.geometry.world_frame import WorldFrame
+from extrap_train.geometry.cameras import WorldFrame
 from extrap_train.reconstruction.continuation import continued_depth
 from extrap_train.reconstruction.new_view import CONTINUED_CONFIDENCE
 from extrap_train.views import Camera, View, stack_poses

@@ -17,7 +17,7 @@ from torch import Tensor
 from trimesh.exchange.ply import export_ply
 
 from extrap_train.data.image_files import to_eight_bits
-from extrap_train.geometry.world_frame import WorldFrame
+from extrap_train.geometry.cameras import WorldFrame
 from extrap_train.reconstruction.cloud import PointCloud
 from extrap_train.reconstruction.fusion import signed_distance
 from extrap_train.reconstruction.global_map import GlobalMap

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from extrap_train.data.synthetic import SyntheticScene, surface_points
 from extrap_train.geometry.viewpoints import directions_from, scene_center
-from extrap_train.geometry.world_frame import WorldFrame
+from extrap_train.geometry.cameras import WorldFrame
 from extrap_train.metrics import psnr
 from extrap_train.reconstruction.cloud import PointCloud
 from extrap_train.reconstruction.cloud_metrics import (

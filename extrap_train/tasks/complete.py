@@ -25,7 +25,7 @@ from extrap_train.data.synthetic import SyntheticScene, build_scene
 from extrap_train.depth.sources import depth_source
 from extrap_train.device import advise_on_sampling_memory
 from extrap_train.errors import InputError
-from extrap_train.geometry.world_frame import WorldFrame
+from extrap_train.geometry.cameras import WorldFrame
 from extrap_train.reconstruction.cloud_pictures import draw_plan
 from extrap_train.reconstruction.completion import CompletionPipeline, Step, complete, map_of_inputs
 from extrap_train.reconstruction.depth_prediction.inference import NetworkDepth

@@ -17,7 +17,7 @@ from extrap_train.data.square_frames import load_held_out
 from extrap_train.data.synthetic import SyntheticScene
 from extrap_train.figures import colour_depth, draw_contact_sheet, error_map, mark_holes
 from extrap_train.gaussians.fit import Diverged
-from extrap_train.geometry.world_frame import WorldFrame
+from extrap_train.geometry.cameras import WorldFrame
 from extrap_train.metrics import lpips_or_reason, psnr, quantised, ssim
 from extrap_train.reconstruction.cloud import PointCloud, cloud_of
 from extrap_train.reconstruction.cloud_pictures import draw_growth, draw_turntable

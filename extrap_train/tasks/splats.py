@@ -19,7 +19,7 @@ from extrap_train.gaussians.gaussian_model import Gaussians
 from extrap_train.gaussians.gaussian_options import BACKGROUNDS, GaussianOptions
 from extrap_train.gaussians.ply import read_comments, read_splats, write_splats
 from extrap_train.gaussians.rasterize import draw, rasterizer
-from extrap_train.geometry.world_frame import WorldFrame
+from extrap_train.geometry.cameras import WorldFrame
 from extrap_train.metrics import psnr, quantised
 from extrap_train.reconstruction.global_map import GlobalMap
 from extrap_train.views import View

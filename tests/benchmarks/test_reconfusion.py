@@ -16,7 +16,7 @@ from benchmarks.run_table import RunOptions, run_table
 from extrap_train.config import CapturesConfig, RulesConfig
 from extrap_train.data.image_files import to_eight_bits
 from extrap_train.errors import InputError
-from extrap_train.geometry.opengl import opengl_from_world_to_cam
+from extrap_train.geometry.foreign_cameras import opengl_from_world_to_cam
 from extrap_train.jobs.local import LocalLauncher
 from tests.benchmarks.analytic import view_at
 

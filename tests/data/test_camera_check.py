@@ -17,7 +17,7 @@ from extrap_train.data.camera_check import (
     require_sound,
 )
 from extrap_train.errors import InputError
-from extrap_train.geometry.opengl import (
+from extrap_train.geometry.foreign_cameras import (
     opengl_from_world_to_cam,
     rigid_inverse,
     world_to_cam_from_opengl,

@@ -12,7 +12,7 @@ from two_views import epipolar_distances
 
 from extrap_train.data.colmap import find_model, read_model, read_model_images
 from extrap_train.errors import InputError
-from extrap_train.geometry.colmap import colmap_from_world_to_cam
+from extrap_train.geometry.foreign_cameras import colmap_from_world_to_cam
 from extrap_train.views import Camera
 
 PINHOLE = 1

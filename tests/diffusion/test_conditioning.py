@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import math
 import torch
 
 from extrap_train.config import ModelConfig
@@ -12,10 +13,11 @@ from extrap_train.diffusion.conditioning import (
     condition_channels,
     filled_warp,
     geometry_channels,
+    positional_encoding,
 )
 from extrap_train.diffusion.encoders import PixelPatches
 from extrap_train.diffusion.model import ExtrapolationModel
-from extrap_train.geometry.encoding import coordinate_grid, positional_encoding
+from extrap_train.geometry.cameras import coordinate_grid
 from extrap_train.geometry.warp import compute_warp
 from extrap_train.views import PairBatch
 
@@ -123,3 +125,11 @@ def test_geometry_is_told_in_units_of_the_scene_and_is_zero_in_holes(
     latents = model.condition(batch).latents
     assert torch.equal(latents[:, :-2], plain), "the further channels come last"
     assert model.unet.config.in_channels == 12 + latents.shape[1]
+
+
+def test_channels_go_by_octave_then_sine_and_cosine() -> None:
+    coordinates = torch.tensor([0.25, -0.5]).reshape(1, 2, 1, 1)
+    encoded = positional_encoding(coordinates, 2)[0, :, 0, 0]
+    angles = [math.pi * 0.25, -math.pi * 0.5]
+    expected = [f(n * a) for n in (1, 2) for f in (math.sin, math.cos) for a in angles]
+    assert torch.allclose(encoded, torch.tensor(expected), atol=1e-6)

@@ -2,7 +2,7 @@ import pytest
 import roma
 import torch
 
-from extrap_train.geometry.cameras import pixel_grid, project, unproject, unproject_to_world
+from extrap_train.geometry.cameras import coordinate_grid, pixel_grid, project, unproject, unproject_to_world
 from extrap_train.views import Camera
 
 
@@ -50,3 +50,9 @@ def test_center_and_forward():
     pixel, depth = project(ahead[None], one)
     torch.testing.assert_close(pixel[0], one.intrinsics[:2, 2])
     assert depth.item() == pytest.approx(2)
+
+
+def test_grid_has_normalised_pixel_centres():
+    grid = coordinate_grid(2, 4)
+    assert torch.allclose(grid[0, 0], torch.tensor([-0.75, -0.25, 0.25, 0.75]))
+    assert torch.allclose(grid[1, :, 0], torch.tensor([-0.5, 0.5]))

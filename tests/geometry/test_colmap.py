@@ -2,7 +2,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from extrap_train.geometry.colmap import (
+from extrap_train.geometry.foreign_cameras import (
     CAMERA_MODELS,
     colmap_from_world_to_cam,
     lens_from_parameters,

@@ -2,7 +2,7 @@
 
 import torch
 
-from extrap_train.geometry.fill import fill_holes
+from extrap_train.geometry.resample import fill_holes
 
 
 def test_known_pixels_stay_and_a_constant_image_is_restored() -> None:

@@ -1,7 +1,7 @@
 import roma
 import torch
 
-from extrap_train.geometry.opengl import opengl_from_world_to_cam, world_to_cam_from_opengl
+from extrap_train.geometry.foreign_cameras import opengl_from_world_to_cam, world_to_cam_from_opengl
 
 
 def test_a_camera_at_the_origin_looks_down_minus_z_with_y_up():

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from extrap_train.geometry.cameras import project
-from extrap_train.geometry.pytorch3d import (
+from extrap_train.geometry.foreign_cameras import (
     NDC_FORMATS,
     Viewpoint,
     camera_from_viewpoint,

@@ -6,7 +6,7 @@ from dataclasses import replace
 import torch
 
 from extrap_train.geometry.cameras import unproject
-from extrap_train.geometry.reduction import reduce_batch, reduce_warp
+from extrap_train.geometry.resample import reduce_batch, reduce_warp
 from extrap_train.geometry.warp import warp_references
 from extrap_train.views import Camera, PairBatch, Warp
 

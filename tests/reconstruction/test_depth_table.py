@@ -22,7 +22,7 @@ from extrap_train.data.synthetic import SyntheticScene, build_scene, render, tra
 from extrap_train.depth.stereo import PlaneSweepStereo
 from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.geometry.viewpoints import directions_from, scene_center
-from extrap_train.geometry.world_frame import WorldFrame
+from extrap_train.geometry.cameras import WorldFrame
 from extrap_train.reconstruction.cloud import cloud_of
 from extrap_train.reconstruction.completion import CompletionPipeline, complete, map_of_inputs
 from extrap_train.reconstruction.depth_prediction.inference import (

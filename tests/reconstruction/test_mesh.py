@@ -9,7 +9,7 @@ import scenes
 import torch
 import trimesh
 
-from extrap_train.geometry.world_frame import WorldFrame
+from extrap_train.geometry.cameras import WorldFrame
 from extrap_train.reconstruction.cloud import cloud_of
 from extrap_train.reconstruction.global_map import GIVEN, GlobalMap, Origin
 from extrap_train.reconstruction.mesh import mesh_of, write_mesh

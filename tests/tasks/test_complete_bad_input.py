@@ -14,7 +14,7 @@ from PIL import Image
 
 from extrap_train.__main__ import main
 from extrap_train.data.image_files import to_eight_bits
-from extrap_train.geometry.opengl import opengl_from_world_to_cam
+from extrap_train.geometry.foreign_cameras import opengl_from_world_to_cam
 from extrap_train.views import Camera
 
 _SIZE = 256

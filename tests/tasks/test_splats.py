@@ -9,7 +9,7 @@ import torch
 from extrap_train.config import SplatsConfig
 from extrap_train.gaussians.fit import Diverged
 from extrap_train.gaussians.ply import read_splats
-from extrap_train.geometry.world_frame import WorldFrame
+from extrap_train.geometry.cameras import WorldFrame
 from extrap_train.reconstruction.global_map import GlobalMap, Origin
 from extrap_train.tasks import splats as task
 from tests.benchmarks.analytic import view_at

@@ -13,7 +13,7 @@ from extrap_train.data.image_files import MAX_PIXELS
 from extrap_train.data.json_files import read_json, read_json_list, require_dict
 from extrap_train.data.paths import check_relative
 from extrap_train.errors import InputError
-from extrap_train.geometry.pytorch3d import NDC_FORMATS
+from extrap_train.geometry.foreign_cameras import NDC_FORMATS
 
 T = TypeVar("T")
 

@@ -17,7 +17,7 @@ from extrap_train.data.co3d.annotations import VIEWPOINT, FrameAnnotation
 from extrap_train.data.depth_files import DepthFile
 from extrap_train.data.paths import file_stamp
 from extrap_train.data.sequences import Frame, Photograph
-from extrap_train.geometry.pytorch3d import NdcFormat, Viewpoint, camera_from_viewpoint
+from extrap_train.geometry.foreign_cameras import NdcFormat, Viewpoint, camera_from_viewpoint
 from extrap_train.views import Camera
 
 _JPEG_HEADER_BYTES, _BLACK_PIXELS_PER_BYTE = 1024, 32

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from extrap_train.data.co3d import FRAME_ANNOTATIONS, SEQUENCE_ANNOTATIONS
 from extrap_train.data.image_files import png_bytes, to_eight_bits
-from extrap_train.geometry.pytorch3d import viewpoint_from_camera
+from extrap_train.geometry.foreign_cameras import viewpoint_from_camera
 from extrap_train.store.atomic import write_atomic
 from extrap_train.views import Camera, View
 

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from extrap_train.geometry.reduction import reduce_batch
+from extrap_train.geometry.resample import reduce_batch
 from extrap_train.geometry.warp.sample import move_points, sample_surfaces
 from extrap_train.geometry.warp.sample_numba import move_points_numba, sample_surfaces_numba
 from extrap_train.geometry.warp.splat import OUTSIDE, ScreenPoints, splat_torch

@@ -16,7 +16,7 @@ from extrap_train.data.sequences import Frame
 from extrap_train.depth import DepthSource
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.diffusion.generator import ViewGenerator
-from extrap_train.geometry.world_frame import WorldFrame
+from extrap_train.geometry.cameras import WorldFrame
 from extrap_train.reconstruction.completion import CompletionPipeline, complete, map_of_inputs
 from extrap_train.reconstruction.depth_prediction.inference import PredictedDepth, observe_in_map
 from extrap_train.reconstruction.depth_prediction.observation import Observation

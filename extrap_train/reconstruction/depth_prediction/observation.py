@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from extrap_train.geometry.fill import fill_holes
+from extrap_train.geometry.resample import fill_holes
 from extrap_train.geometry.visibility import Ball, trace_visibility
 from extrap_train.geometry.warp import warp_references
 from extrap_train.views import Camera
