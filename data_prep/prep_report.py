@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
-from data_prep.drop_summary import group_reasons
+from data_prep.filter import group_reasons
 from extrap_train.data.examples import linspace_indices, pack, read_example
 from extrap_train.data.prepared import UNTOUCHED, Pairs, PreparedData
 from extrap_train.data.square_frames import held_out_mask

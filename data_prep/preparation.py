@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from data_prep.correct import CORRECTION_VERSION
-from data_prep.drop_summary import group_reasons
-from data_prep.filter import judge_all
+from data_prep.filter import group_reasons, judge_all
 from data_prep.model_cache import PrepModels, release_models
 from data_prep.sequence_job import NO_SPACE, PrepContext, SequenceJob, prepare_sequence
 from data_prep.split import SequenceSplit, split_sequences

@@ -21,7 +21,7 @@ _FORKED = (
     "extrap_train.tasks.category",
     "benchmarks.run_table",
     "benchmarks.run.run_method",
-    "benchmarks.methods.adapted",
+    "benchmarks.methods.diffusion",
     "benchmarks.methods.incremental",
     "benchmarks.methods.dngaussian",
 )
@@ -65,7 +65,7 @@ def shared() -> Path:
 @pytest.fixture(scope="session")
 def fork_server() -> ForkServerContext:
     """Starts processes that need import nothing, methods under test among them."""
-    from extrap_train.jobs.fork_server import start_fork_server
+    from extrap_train.jobs import start_fork_server
 
     return start_fork_server(_FORKED)
 

@@ -16,7 +16,7 @@ from extrap_train.data.co3d import read_category
 from extrap_train.data.examples import ExampleReader, linspace_indices
 from extrap_train.data.module import ValidationBatches
 from extrap_train.data.square_frames import object_square
-from extrap_train.diffusion.baselines import mean_filled_warp
+from extrap_train.diffusion.evaluation import mean_filled_warp
 from extrap_train.geometry.warp import compute_warp
 from extrap_train.metrics import psnr, quantised
 from extrap_train.views import PairBatch

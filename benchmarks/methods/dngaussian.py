@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor, nn
 
-from benchmarks.methods.gaussian_method import MonocularMethod
+from benchmarks.methods.threedgs import MonocularMethod
 from extrap_train.config.options import option
 from extrap_train.gaussians.density import remove
 from extrap_train.gaussians.gaussian_model import GaussianParameters, Gaussians, sh_basis

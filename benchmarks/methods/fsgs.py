@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from benchmarks.methods.gaussian_method import MonocularMethod
+from benchmarks.methods.threedgs import MonocularMethod
 from extrap_train.config.options import option
 from extrap_train.errors import InputError
 from extrap_train.gaussians.gaussian_model import GaussianParameters, from_tensors

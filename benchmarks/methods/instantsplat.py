@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from benchmarks.methods.gaussian_method import GaussianMethod
+from benchmarks.methods.threedgs import ThreeDgs
 from extrap_train.config.options import option
 from extrap_train.depth import DepthMap
 from extrap_train.gaussians.density import rotation_matrices
@@ -65,7 +65,7 @@ class InstantSplatRecipe(Recipe):
 
 
 @dataclass(frozen=True)
-class InstantSplat(GaussianMethod):
+class InstantSplat(ThreeDgs):
     """One point per pixel, no densification, high learning rates, joint pose refinement."""
 
     recipe = InstantSplatRecipe

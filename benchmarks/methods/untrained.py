@@ -15,7 +15,7 @@ from benchmarks.methods.base import (
 )
 from extrap_train.config.options import option
 from extrap_train.data.examples import query_batch
-from extrap_train.diffusion.baselines import inpainted_warp
+from extrap_train.diffusion.evaluation import inpainted_warp
 from extrap_train.geometry.viewpoints import references_by_nearness
 from extrap_train.geometry.warp import compute_warp
 from extrap_train.views import stack_cameras

@@ -12,8 +12,8 @@ from jaxtyping import Float
 from extrap_train.data.examples import Example, collate, query_batch
 from extrap_train.depth import require_depth
 from extrap_train.errors import InputError
-from extrap_train.geometry.resample import fill_holes
 from extrap_train.geometry.orbits import turn_camera
+from extrap_train.geometry.resample import fill_holes
 from extrap_train.geometry.viewpoints import (
     camera_centers,
     common_center,

@@ -1,19 +1,20 @@
-"""Scores of a model and of the baselines on the same held-out examples."""
+"""Scores of a model, and of baselines without any training, on the same held-out examples."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+import cv2
+import numpy as np
 import pandas as pd
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from extrap_train.config import SamplerConfig
-from extrap_train.diffusion.baselines import inpainted_warp, mean_filled_warp, nearest_reference
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sample_views
 from extrap_train.metrics import Distance, psnr, quantised, ssim
-from extrap_train.views import PairBatch, combine
+from extrap_train.views import PairBatch, Warp, combine
 
 
 @dataclass(frozen=True)
@@ -26,10 +27,10 @@ class Prediction:
 
 
 def baseline_images(batch: PairBatch) -> dict[str, Float[Tensor, "b 3 h w"]]:
-    """The three baselines; the batch must hold its warp."""
+    """The nearest photograph, and the warp with its holes filled; the batch must hold its warp."""
     assert batch.warp is not None
     return {
-        "nearest": nearest_reference(batch),
+        "nearest": batch.reference_images[:, 0],
         "inpainted": inpainted_warp(batch.warp),
         "mean_fill": mean_filled_warp(batch.warp),
     }
@@ -133,3 +134,29 @@ def views_named(predictions: list[Prediction], names: list[str]) -> Prediction:
         found,
         {m: taken([p.images[m] for p in predictions]) for m in predictions[0].images},
     )
+
+
+_TELEA_RADIUS = 3.0
+
+
+def inpainted_warp(warp: Warp) -> Float[Tensor, "b 3 h w"]:
+    """The warp with its holes inpainted (Telea 2004)."""
+    return torch.stack([_telea(i, m) for i, m in zip(warp.image, warp.mask, strict=True)])
+
+
+def mean_filled_warp(warp: Warp) -> Float[Tensor, "b 3 h w"]:
+    """The warp with its holes in the mean colour of what is known; mid-grey where nothing is."""
+    known = warp.mask[:, None]
+    count = known.sum((-2, -1), keepdim=True)
+    mean = (warp.image * known).sum((-2, -1), keepdim=True) / count.clamp_min(1)
+    return torch.where(known > 0, warp.image, torch.where(count > 0, mean, 0.5))
+
+
+def _telea(image: Float[Tensor, "3 h w"], mask: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
+    pixels = (image * 255).round().byte().permute(1, 2, 0).cpu().numpy()
+    holes = (mask == 0).byte().cpu().numpy()
+    if holes.all():
+        return torch.full_like(image, 0.5)
+    painted = cv2.inpaint(np.ascontiguousarray(pixels), holes, _TELEA_RADIUS, cv2.INPAINT_TELEA)
+    filled = torch.from_numpy(painted).permute(2, 0, 1).to(image) / 255
+    return torch.where(mask > 0, image, filled)

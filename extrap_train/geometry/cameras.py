@@ -1,13 +1,13 @@
 """Pixels, points and worlds: projection both ways, and a world centred on the scene."""
 
+from dataclasses import dataclass, replace
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from extrap_train.views import Camera
-from dataclasses import dataclass, replace
-from jaxtyping import Float
-from torch import Tensor
+
 from extrap_train.views import Camera, View
+
 
 def pixel_grid(
     height: int, width: int, device: torch.device | str = "cpu"

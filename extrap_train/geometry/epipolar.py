@@ -100,7 +100,7 @@ def triangulate(
     and likewise for v are linear in z and solved in the sense of least squares.
     """
     first_to_second = second.world_to_cam @ first.cam_to_world
-    rays = _rays(first_pixels, first)
+    rays = viewing_rays(first_pixels, first)
     turned = rays @ first_to_second[:3, :3].mT
     a, b = turned @ second.intrinsics.mT, second.intrinsics @ first_to_second[:3, 3]
     slope = a[:, :2] - second_pixels * a[:, 2:]
@@ -108,7 +108,7 @@ def triangulate(
     depth = (slope * rest).sum(-1) / slope.square().sum(-1).clamp_min(1e-12)
     seen = depth[:, None] * a + b
     error = (seen[:, :2] / seen[:, 2:] - second_pixels).norm(dim=-1)
-    cosine = functional.cosine_similarity(turned, _rays(second_pixels, second), dim=-1)
+    cosine = functional.cosine_similarity(turned, viewing_rays(second_pixels, second), dim=-1)
     return Triangulated(
         torch.where((seen[:, 2] > 0) & depth.isfinite(), depth, 0),
         torch.acos(cosine.clamp(-1, 1)),
@@ -116,6 +116,6 @@ def triangulate(
     )
 
 
-def _rays(pixels: Float[Tensor, "n 2"], camera: Camera) -> Float[Tensor, "n 3"]:
+def viewing_rays(pixels: Float[Tensor, "n 2"], camera: Camera) -> Float[Tensor, "n 3"]:
     """Viewing rays of depth 1 in the camera's frame."""
     return functional.pad(pixels, (0, 1), value=1.0) @ torch.linalg.inv(camera.intrinsics).mT

@@ -13,19 +13,14 @@ COLMAP
 
 from dataclasses import dataclass
 from typing import Literal, get_args
-import torch
-from jaxtyping import Float
-from torch import Tensor
-from extrap_train.views import Camera
-import roma
-from jaxtyping import Float
-from torch import Tensor
-from dataclasses import dataclass
+
 import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
 from extrap_train.geometry.lens import Lens
+from extrap_train.views import Camera
 
 NdcFormat = Literal["ndc_isotropic", "ndc_norm_image_bounds"]
 NDC_FORMATS: tuple[str, ...] = get_args(NdcFormat)

@@ -1,20 +1,14 @@
 """Images at other places and sizes, and without holes."""
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
-from torch.nn import functional
-from extrap_train.views import send
 import math
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
-from dataclasses import replace
-from jaxtyping import Float
-from torch import Tensor
-from torch.nn import functional
-from extrap_train.views import PairBatch, Warp
+
+from extrap_train.views import PairBatch, Warp, send
 
 _LOBES = 3
 

@@ -5,8 +5,12 @@ what it returns is a small record, and a job that finds its files finished retur
 nothing is lost when any of this is killed, and the same command goes on where it stopped.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+import multiprocessing
+import os
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
+from multiprocessing import forkserver
+from multiprocessing.context import ForkServerContext
 from typing import Protocol, TypeVar, runtime_checkable
 
 ONE_THREAD = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
@@ -37,3 +41,23 @@ class Launcher(Protocol):
         more, alone.
         """
         ...
+
+
+def start_fork_server(preload: Collection[str]) -> ForkServerContext:
+    """Start this process's server unless it runs; returns what starts processes from it.
+
+    The server imports the modules `preload`, which must start no thread and open no GPU then. It
+    holds none of this process's threads and devices, its libraries have one thread each, and it
+    ends with this process. There is one per process: whoever starts it first decides what it
+    imports, and its workers import the rest themselves.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([*preload])
+    before = dict(os.environ)
+    os.environ |= dict.fromkeys(ONE_THREAD, "1")  # libraries read them as they load
+    try:
+        forkserver.ensure_running()
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
+    return context

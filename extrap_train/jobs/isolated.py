@@ -22,8 +22,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import IO, Any
 
-from extrap_train.jobs import ONE_THREAD, Died, Item
-from extrap_train.jobs.fork_server import start_fork_server
+from extrap_train.jobs import ONE_THREAD, Died, Item, start_fork_server
 
 MAX_RESULT_BYTES = 2**30
 _TIMED_OUT = 124

@@ -12,8 +12,7 @@ from multiprocessing.connection import wait as wait_for_any
 from types import TracebackType
 from typing import Any
 
-from extrap_train.jobs import ONE_THREAD, Died, Item, Result
-from extrap_train.jobs.fork_server import start_fork_server
+from extrap_train.jobs import ONE_THREAD, Died, Item, Result, start_fork_server
 
 WAITING_PER_WORKER = 2
 """Jobs that are handed out ahead of time: memory must not grow with the number of jobs."""

@@ -13,9 +13,8 @@ from torch.nn import functional
 
 from extrap_train.config import FlowMatcherConfig
 from extrap_train.geometry.cameras import pixel_grid
-from extrap_train.geometry.resample import fill_holes
 from extrap_train.geometry.ncc import windowed_correlation
-from extrap_train.geometry.resample import sample_pixels
+from extrap_train.geometry.resample import fill_holes, sample_pixels
 from extrap_train.matching import DenseFlow, Matches, resize, to_grey
 
 LARGEST_ENLARGEMENT = 2.0

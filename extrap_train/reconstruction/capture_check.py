@@ -5,9 +5,10 @@ Points triangulated from a view and one neighbour must be seen by the other wher
 distances between cameras), and lie where depth files say (the unit of depth).
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -15,22 +16,29 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from extrap_train.errors import InputError
-from extrap_train.geometry.cameras import project, unproject_to_world
-from extrap_train.geometry.epipolar import epipolar_distance, fundamental_matrix, triangulate
+from extrap_train.geometry.cameras import project, transform, unproject_to_world
+from extrap_train.geometry.epipolar import (
+    epipolar_distance,
+    fundamental_matrix,
+    triangulate,
+    viewing_rays,
+)
 from extrap_train.geometry.viewpoints import references_by_nearness
 from extrap_train.matching.sift import descriptor_distance, detect_sift, match_mutual
-from extrap_train.reconstruction.pose_check import (
-    FAR_PIXELS,
-    LEAST_MATCHES,
-    RATIO,
-    Pixels,
-    check_matches,
-    small_view,
-)
-from extrap_train.views import View, stack_poses
+from extrap_train.views import Camera, View, stack_poses
 
+Pixels = Float[np.ndarray, "_ 2"]
+"""Pixels, one row per match."""
 SIDE = 960
 """Photographs are matched at this many pixels a side, at most."""
+POSE_SIDE = 640
+"""The same, where the poses alone are checked."""
+LEAST_MATCHES = 30
+FAR_PIXELS = 4.0
+"""Median epipolar distance from which poses are suspect."""
+CLEARLY_BETTER = 0.4
+RATIO = 0.75
+"""Largest ratio of the nearest and second nearest distance in Lowe's test."""
 LEAST_POINTS = 8
 """Least points in a third view: two views already agree on them, so fewer suffice."""
 LEAST_PARALLAX_RAD = np.deg2rad(1.5)
@@ -46,6 +54,10 @@ MASK_DISAGREEMENT = 0.3
 """Share of the matched points in either view's mask that may be missing from the other's."""
 MASK_SHARES = (0.002, 0.95)
 """Range of an object mask's share of the picture."""
+_FLIPS = {
+    "OpenGL axes (+Y up, -Z forward)": (1.0, -1.0, -1.0),
+    "PyTorch3D axes (+X left, +Y up)": (-1.0, -1.0, 1.0),
+}
 
 
 @dataclass(frozen=True)
@@ -92,7 +104,7 @@ class CaptureCheck:
 
 def check_capture(views: Sequence[View]) -> CaptureCheck:
     """Match three views or more; every problem names its views and likely cause."""
-    small = [small_view(view, SIDE) for view in views]
+    small = [_small_view(view, SIDE) for view in views]
     cameras = stack_poses([view.camera for view in small])
     nearest = references_by_nearness(cameras, cameras)
     features = [detect_sift(view.image) for view in small]
@@ -139,11 +151,11 @@ def _measure(
 ) -> MatchedViews:
     camera, nearest, third = (views[index].camera for index in indices)
     distances = epipolar_distance(pixels, matches, fundamental_matrix(camera, nearest))
-    found = triangulate(
-        torch.from_numpy(pixels).float(), torch.from_numpy(matches).float(), camera, nearest
-    )
+    starts, ends = torch.from_numpy(pixels).float(), torch.from_numpy(matches).float()
+    found = triangulate(starts, ends, camera, nearest)
     usable = (found.depth > 0) & (found.parallax_rad > LEAST_PARALLAX_RAD)
-    points = _points(pixels, torch.where(usable, found.depth, torch.nan), views[indices[0]])
+    depth = torch.where(usable, found.depth, torch.nan)[:, None]
+    points = transform(camera.cam_to_world, depth * viewing_rays(starts, camera))
     _, in_pairs, in_others = np.intersect1d(
         pairs[:, 0], others[:, 0], assume_unique=True, return_indices=True
     )
@@ -151,15 +163,6 @@ def _measure(
     reprojected, _ = project(points[in_pairs[kept]], third)
     seen = third_pixels[others[in_others[kept], 1]]
     return MatchedViews(indices, pixels, matches, distances, points, seen, reprojected.numpy())
-
-
-def _points(
-    pixels: Float[np.ndarray, "n 2"], depth: Float[Tensor, " n"], view: View
-) -> Float[Tensor, "n 3"]:
-    rays = np.concatenate([pixels, np.ones((len(pixels), 1))], 1)
-    rays = torch.from_numpy(rays).float() @ torch.linalg.inv(view.camera.intrinsics).mT
-    matrix = view.camera.cam_to_world
-    return (depth[:, None] * rays) @ matrix[:3, :3].mT + matrix[:3, 3]
 
 
 def _median(values: Float[np.ndarray, " n"], least: int = LEAST_MATCHES) -> float:
@@ -257,3 +260,62 @@ def _inside(mask: Float[Tensor, "h w"], pixels: Float[np.ndarray, "n 2"]) -> np.
 
 def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+
+
+def check_poses(views: Sequence[View]) -> None:
+    """Raise InputError where matches contradict the poses and another convention explains them.
+
+    Too few matches say nothing, and poses that no convention mends are left to the depth source.
+    """
+    small = [_small_view(view, POSE_SIDE) for view in views]
+    described = [(view.camera, detect_sift(view.image)) for view in small]
+    matched = []
+    for (one, features), (other, others) in pairwise(described):
+        pairs = match_mutual(descriptor_distance(features, others), RATIO)
+        matched.append((one, other, features.pixels[pairs[:, 0]], others.pixels[pairs[:, 1]]))
+    check_matches(matched)
+
+
+def check_matches(matched: Iterable[tuple[Camera, Camera, Pixels, Pixels]]) -> None:
+    """`check_poses` of pairs of views whose pixels are matched."""
+    given: list[float] = []
+    others: dict[str, list[float]] = {}
+    for one, other, first, second in matched:
+        if len(first) < LEAST_MATCHES:
+            continue
+        given.append(_distance(first, second, one, other))
+        others_of = _read_otherwise(other)
+        for name, camera in _read_otherwise(one).items():
+            others.setdefault(name, []).append(_distance(first, second, camera, others_of[name]))
+    if not given or np.median(given) < FAR_PIXELS:
+        return
+    best = min(others, key=lambda name: float(np.median(others[name])))
+    if np.median(others[best]) < CLEARLY_BETTER * np.median(given):
+        raise InputError(
+            f"the poses contradict the photographs: matches lie {np.median(given):.1f} px from "
+            f"where they should, but {np.median(others[best]):.1f} px if the poses are read as "
+            f"{best}; convert them first"
+        )
+
+
+def _small_view(view: View, side: int) -> View:
+    """The view with at most this many pixels a side."""
+    scale = side / max(view.camera.height, view.camera.width)
+    if scale >= 1:
+        return view
+    return view.resized(round(view.camera.height * scale), round(view.camera.width * scale))
+
+
+def _read_otherwise(camera: Camera) -> dict[str, Camera]:
+    """The camera, had its matrix been meant otherwise."""
+    flipped = {
+        name: torch.diag(torch.tensor([*signs, 1.0])) @ camera.world_to_cam
+        for name, signs in _FLIPS.items()
+    }
+    matrices = flipped | {"camera-to-world matrices": camera.cam_to_world}
+    return {name: replace(camera, world_to_cam=found) for name, found in matrices.items()}
+
+
+def _distance(first: Pixels, second: Pixels, one: Camera, other: Camera) -> float:
+    """Median distance of the second points from the first ones' epipolar lines, in pixels."""
+    return float(np.median(epipolar_distance(first, second, fundamental_matrix(one, other))))

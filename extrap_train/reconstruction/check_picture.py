@@ -10,8 +10,7 @@ from matplotlib.axes import Axes
 from extrap_train.figures import save_figure
 from extrap_train.geometry.epipolar import epipolar_lines, fundamental_matrix
 from extrap_train.geometry.viewpoints import camera_centers, fit_orbit
-from extrap_train.reconstruction.capture_check import CaptureCheck, MatchedViews
-from extrap_train.reconstruction.pose_check import FAR_PIXELS
+from extrap_train.reconstruction.capture_check import FAR_PIXELS, CaptureCheck, MatchedViews
 from extrap_train.views import View, stack_poses
 
 ROWS = 3

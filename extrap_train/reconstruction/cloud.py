@@ -9,8 +9,7 @@ from torch.nn import functional
 
 from extrap_train.geometry.cameras import unproject_to_world
 from extrap_train.geometry.warp.surface import normals_from_depth
-from extrap_train.reconstruction.agreement import Sight, look_up
-from extrap_train.reconstruction.global_map import MOST_COMPARED, GlobalMap, MapView
+from extrap_train.reconstruction.global_map import MOST_COMPARED, GlobalMap, MapView, Sight, look_up
 from extrap_train.views import combine
 
 LARGEST_STEP = 0.05

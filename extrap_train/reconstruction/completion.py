@@ -12,10 +12,16 @@ from extrap_train.depth import DepthSource
 from extrap_train.diffusion.generator import ViewGenerator
 from extrap_train.geometry.cameras import unproject
 from extrap_train.reconstruction.depth_prediction.inference import DepthPredictor
-from extrap_train.reconstruction.global_map import GENERATED, GIVEN, GlobalMap, MapView, Origin
+from extrap_train.reconstruction.global_map import (
+    GENERATED,
+    GIVEN,
+    GlobalMap,
+    MapView,
+    Origin,
+    prior_of,
+)
 from extrap_train.reconstruction.new_view import Proposal, propose, propose_predicted
 from extrap_train.reconstruction.planner import REFERENCES, Query, next_query
-from extrap_train.reconstruction.prior import prior_of
 from extrap_train.views import Camera, View, stack_cameras
 
 LEAST_OVERLAP = 50

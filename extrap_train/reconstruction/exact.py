@@ -11,8 +11,8 @@ from extrap_train.data.examples import query_batch
 from extrap_train.data.synthetic import SyntheticScene, render, trace
 from extrap_train.depth import DepthMap, PointMaps, point_maps_of
 from extrap_train.diffusion.generator import GeneratedViews
-from extrap_train.geometry.warp import compute_warp
 from extrap_train.geometry.cameras import WorldFrame
+from extrap_train.geometry.warp import compute_warp
 from extrap_train.reconstruction.planner import REFERENCES
 from extrap_train.views import Camera, View
 

@@ -11,9 +11,8 @@ from plyfile import PlyData, PlyElement
 
 from extrap_train.data.image_files import to_eight_bits
 from extrap_train.figures import picture_names, save_picture
-from extrap_train.geometry.foreign_cameras import colmap_from_world_to_cam
-from extrap_train.geometry.foreign_cameras import opengl_from_world_to_cam
 from extrap_train.geometry.cameras import WorldFrame
+from extrap_train.geometry.foreign_cameras import colmap_from_world_to_cam, opengl_from_world_to_cam
 from extrap_train.reconstruction.cloud import PointCloud
 from extrap_train.reconstruction.global_map import GlobalMap, MapView
 from extrap_train.store.atomic import write_atomic

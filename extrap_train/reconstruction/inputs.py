@@ -12,6 +12,7 @@ from torch.nn import functional
 from extrap_train.data.sequences import Frame
 from extrap_train.depth import RELIABLE_CONFIDENCE, DepthSource
 from extrap_train.errors import InputError
+from extrap_train.geometry.cameras import WorldFrame
 from extrap_train.geometry.orbits import fit_circle
 from extrap_train.geometry.viewpoints import (
     camera_centers,
@@ -20,7 +21,6 @@ from extrap_train.geometry.viewpoints import (
     pairwise_angles,
     scene_center,
 )
-from extrap_train.geometry.cameras import WorldFrame
 from extrap_train.reconstruction.continuation import continued_depth
 from extrap_train.reconstruction.new_view import CONTINUED_CONFIDENCE
 from extrap_train.views import Camera, View, stack_poses

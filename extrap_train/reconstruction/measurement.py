@@ -11,8 +11,7 @@ from extrap_train.depth import RELIABLE_CONFIDENCE, DepthSource
 from extrap_train.errors import InputError
 from extrap_train.geometry.alignment import Edges, align_view
 from extrap_train.geometry.cameras import unproject_to_world
-from extrap_train.reconstruction.global_map import GlobalMap
-from extrap_train.reconstruction.prior import Prior
+from extrap_train.reconstruction.global_map import GlobalMap, Prior
 from extrap_train.views import View
 
 

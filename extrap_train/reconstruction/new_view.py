@@ -14,10 +14,16 @@ from extrap_train.config import ConfidenceConfig
 from extrap_train.depth import DepthSource
 from extrap_train.geometry.cameras import unproject_to_world
 from extrap_train.geometry.ncc import ncc_consistent
-from extrap_train.reconstruction.agreement import Sight, look_up
 from extrap_train.reconstruction.continuation import continued_depth
 from extrap_train.reconstruction.depth_prediction.inference import DepthPredictor
-from extrap_train.reconstruction.global_map import MOST_COMPARED, GlobalMap
+from extrap_train.reconstruction.global_map import (
+    MOST_COMPARED,
+    GlobalMap,
+    Prior,
+    Sight,
+    look_up,
+    prior_of,
+)
 from extrap_train.reconstruction.measurement import (
     Measured,
     confirmed,
@@ -25,7 +31,6 @@ from extrap_train.reconstruction.measurement import (
     measure,
     supported,
 )
-from extrap_train.reconstruction.prior import Prior, prior_of
 from extrap_train.views import Camera, View
 
 CONTINUED_CONFIDENCE = 0.15

@@ -26,6 +26,7 @@ from extrap_train.depth.sources import depth_source
 from extrap_train.device import advise_on_sampling_memory
 from extrap_train.errors import InputError
 from extrap_train.geometry.cameras import WorldFrame
+from extrap_train.reconstruction.capture_check import check_poses
 from extrap_train.reconstruction.cloud_pictures import draw_plan
 from extrap_train.reconstruction.completion import CompletionPipeline, Step, complete, map_of_inputs
 from extrap_train.reconstruction.depth_prediction.inference import NetworkDepth
@@ -49,7 +50,6 @@ from extrap_train.reconstruction.map_files import (
     view_bytes,
 )
 from extrap_train.reconstruction.planner import Query, expected_order, orbit_queries
-from extrap_train.reconstruction.pose_check import check_poses
 from extrap_train.reconstruction.viewer import CloudViewer
 from extrap_train.store import Outcome
 from extrap_train.store.digests import file_digest

@@ -23,18 +23,17 @@ from extrap_train.reconstruction.cloud import PointCloud, cloud_of
 from extrap_train.reconstruction.cloud_pictures import draw_growth, draw_turntable
 from extrap_train.reconstruction.completion import CompletionPipeline, Step
 from extrap_train.reconstruction.export import write_cloud, write_colmap, write_views
-from extrap_train.reconstruction.global_map import GENERATED, GIVEN, GlobalMap, MapView
+from extrap_train.reconstruction.global_map import GENERATED, GIVEN, GlobalMap, MapView, prior_of
 from extrap_train.reconstruction.inputs import stand_where
-from extrap_train.reconstruction.mesh import write_mesh
-from extrap_train.reconstruction.planner import REFERENCES
-from extrap_train.reconstruction.prior import prior_of
-from extrap_train.reconstruction.report import (
+from extrap_train.reconstruction.map_scores import (
     cloud_scores,
     coverage_of,
     drift,
     step_records,
     view_consistency,
 )
+from extrap_train.reconstruction.mesh import write_mesh
+from extrap_train.reconstruction.planner import REFERENCES
 from extrap_train.runs import provenance
 from extrap_train.store.records import write_summary
 from extrap_train.tasks.scene_inputs import photograph_digests

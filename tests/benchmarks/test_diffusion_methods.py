@@ -15,10 +15,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from benchmarks.catalogue import Catalogue
-from benchmarks.methods import adapted
-from benchmarks.methods.adapted import AdaptedDiffusion
+from benchmarks.methods import diffusion
 from benchmarks.methods.base import Method, SceneInputs, Unavailable
-from benchmarks.methods.diffusion import Diffusion, _load_cached
+from benchmarks.methods.diffusion import AdaptedDiffusion, Diffusion, _load_cached
 from benchmarks.methods.incremental import IncrementalDiffusion
 from benchmarks.report.aggregate import read_results
 from benchmarks.run.plan import TableFolder
@@ -175,7 +174,7 @@ def test_an_adapter_goes_even_where_adapting_fails(
     def fail(*_: object, **__: object) -> None:
         raise RuntimeError("no luck")
 
-    monkeypatch.setattr(adapted, "adapt", fail)
+    monkeypatch.setattr(diffusion, "adapt", fail)
     before = _state(weights)
     with pytest.raises(RuntimeError, match="no luck"):
         AdaptedDiffusion(weights=weights).synthesize(scene_inputs()[0])

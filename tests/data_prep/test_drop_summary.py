@@ -1,6 +1,6 @@
 """Reasons, summed up."""
 
-from data_prep.drop_summary import ReasonGroup, group_reasons
+from data_prep.filter import ReasonGroup, group_reasons
 
 CUT = (
     "12 of 12 frames cannot be used, the first because of /out/eyes9_run/{}/000{}.png: no such file"

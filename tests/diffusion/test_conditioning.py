@@ -1,8 +1,8 @@
 """The condition's channels stand in their documented order, and its null is the same everywhere."""
 
+import math
 from dataclasses import replace
 
-import math
 import torch
 
 from extrap_train.config import ModelConfig

@@ -16,7 +16,6 @@ from torch import Tensor
 from benchmarks.methods.base import SceneInputs
 from benchmarks.methods.dngaussian import DnGaussian
 from benchmarks.methods.fsgs import Fsgs
-from benchmarks.methods.gaussian_method import GaussianMethod
 from benchmarks.methods.instantsplat import InstantSplat
 from benchmarks.methods.threedgs import ThreeDgs
 from extrap_train.data.synthetic import build_scene, handheld_orbit, render
@@ -30,7 +29,7 @@ SCENES = ("apple", "chair", "hydrant", "teddybear")
 SEEDS = (0, 1, 2)
 BUDGET = {"iterations": 1500, "init_points": 600, "max_gaussians": 1200}
 # The first three start from the same points, so that what follows is what differs.
-METHODS: dict[str, GaussianMethod] = {
+METHODS: dict[str, ThreeDgs] = {
     "3DGS": ThreeDgs(**BUDGET),
     "FSGS": Fsgs(**BUDGET),
     "DNGaussian": DnGaussian(**BUDGET, init="triangulated", hash_levels=8, hash_log2_size=12),
@@ -111,7 +110,7 @@ def measured(
     draw: str,
     scenes: Sequence[str] = SCENES,
     seeds: Sequence[int] = SEEDS,
-    methods: Mapping[str, GaussianMethod] = METHODS,
+    methods: Mapping[str, ThreeDgs] = METHODS,
 ) -> Scores:
     """Every method on every scene and seed, each fit told as it ends."""
     found: dict[tuple[str, str, int], list[float]] = {}

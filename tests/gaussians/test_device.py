@@ -15,7 +15,6 @@ from torch import Tensor
 from benchmarks.methods.base import SceneInputs
 from benchmarks.methods.dngaussian import DnGaussian
 from benchmarks.methods.fsgs import Fsgs
-from benchmarks.methods.gaussian_method import GaussianMethod
 from benchmarks.methods.instantsplat import InstantSplat
 from benchmarks.methods.threedgs import ThreeDgs
 from extrap_train.depth import DepthMap
@@ -38,7 +37,7 @@ SMALL: dict[str, Any] = {
     "max_gaussians": 240,
 }
 GROWING = SMALL | {"densify_from": 0, "densify_gradient": 1e-6, "reset_first": 100}
-METHODS: dict[str, GaussianMethod] = {
+METHODS: dict[str, ThreeDgs] = {
     "3dgs": ThreeDgs(**GROWING),
     "3dgs, dense, white": ThreeDgs(**GROWING, init="dense", background="white"),
     "fsgs": Fsgs(**GROWING, unpool_proximity=1e-4, unpool_scale=0.0),
@@ -98,9 +97,7 @@ class _Made:
     fit: Fit
 
 
-def _both(
-    two_devices: TwoDevices, method: GaussianMethod, inputs: SceneInputs
-) -> tuple[_Made, _Made]:
+def _both(two_devices: TwoDevices, method: ThreeDgs, inputs: SceneInputs) -> tuple[_Made, _Made]:
     """On the CPU and on the other device. Both within the mode: PyTorch multiplies matrices in
     another order, with other last bits, where a mode is on.
     """

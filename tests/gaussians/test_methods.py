@@ -11,7 +11,6 @@ import torch
 from benchmarks.methods.base import Method, SceneInputs, Synthesis
 from benchmarks.methods.dngaussian import DnGaussian
 from benchmarks.methods.fsgs import Fsgs
-from benchmarks.methods.gaussian_method import GaussianMethod
 from benchmarks.methods.instantsplat import InstantSplat
 from benchmarks.methods.threedgs import ThreeDgs
 from extrap_train.depth import DepthMap
@@ -27,7 +26,7 @@ from extrap_train.metrics import psnr
 from tests.benchmarks.analytic import scene_inputs
 
 SMALL = {"iterations": 60, "full_iterations": 240, "init_points": 200, "max_gaussians": 400}
-METHODS: dict[str, GaussianMethod] = {
+METHODS: dict[str, ThreeDgs] = {
     "3dgs": ThreeDgs(**SMALL),
     "fsgs": Fsgs(**SMALL),
     "dngaussian": DnGaussian(**SMALL | {"full_iterations": 6000}, hash_levels=4, hash_log2_size=10),
@@ -40,10 +39,10 @@ each_method = pytest.mark.parametrize("name", METHODS)
 def _synthesized(name: str) -> tuple[Synthesis, Fit]:
     """What a method makes of the scene, and the fit behind it: once for all tests of it."""
     fits: list[Fit] = []
-    fitted = GaussianMethod.fit_scene
+    fitted = ThreeDgs.fit_scene
     with pytest.MonkeyPatch.context() as patch:
         keep = lambda method, inputs: fits.append(fitted(method, inputs)) or fits[-1]  # noqa: E731
-        patch.setattr(GaussianMethod, "fit_scene", keep)
+        patch.setattr(ThreeDgs, "fit_scene", keep)
         return METHODS[name].synthesize(scene_inputs(size=24)[0]), fits[0]
 
 

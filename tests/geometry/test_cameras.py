@@ -2,7 +2,13 @@ import pytest
 import roma
 import torch
 
-from extrap_train.geometry.cameras import coordinate_grid, pixel_grid, project, unproject, unproject_to_world
+from extrap_train.geometry.cameras import (
+    coordinate_grid,
+    pixel_grid,
+    project,
+    unproject,
+    unproject_to_world,
+)
 from extrap_train.views import Camera
 
 

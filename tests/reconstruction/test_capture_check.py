@@ -8,8 +8,8 @@ import torch
 from traced_scenes import SCENES, orbit_camera, render
 
 from extrap_train.geometry.cameras import unproject_to_world
-from extrap_train.geometry.lens import Lens, undistort
 from extrap_train.geometry.foreign_cameras import flip_up_and_forward
+from extrap_train.geometry.lens import Lens, undistort
 from extrap_train.reconstruction.capture_check import check_capture
 from extrap_train.reconstruction.check_picture import draw_check
 from extrap_train.views import View

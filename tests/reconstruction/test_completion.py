@@ -17,12 +17,11 @@ from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
 from extrap_train.geometry.warp import compute_warp
 from extrap_train.reconstruction.cloud import cloud_of
 from extrap_train.reconstruction.completion import CompletionPipeline, complete, map_of_inputs
-from extrap_train.reconstruction.global_map import GENERATED, GlobalMap
+from extrap_train.reconstruction.global_map import GENERATED, GlobalMap, Prior, prior_of
 from extrap_train.reconstruction.map_files import load_map, save_view
 from extrap_train.reconstruction.measurement import Measured, supported
 from extrap_train.reconstruction.new_view import propose
 from extrap_train.reconstruction.planner import orbit_queries
-from extrap_train.reconstruction.prior import Prior, prior_of
 from extrap_train.views import Camera, View, stack_cameras
 
 SIZE = 64

@@ -21,8 +21,8 @@ from extrap_train.reconstruction.cloud import cloud_of
 from extrap_train.reconstruction.completion import CompletionPipeline, complete, map_of_inputs
 from extrap_train.reconstruction.exact import ExactDepth, ExactGenerator
 from extrap_train.reconstruction.inputs import choose_frames, first_views, fit_world_frame
+from extrap_train.reconstruction.map_scores import cloud_scores
 from extrap_train.reconstruction.planner import orbit_queries
-from extrap_train.reconstruction.report import cloud_scores
 from extrap_train.views import Camera, View, stack_poses
 
 _SIZE = 128

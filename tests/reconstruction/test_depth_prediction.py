@@ -47,8 +47,8 @@ from extrap_train.reconstruction.depth_prediction.observation import (
     MEASURED,
     observe,
 )
+from extrap_train.reconstruction.global_map import prior_of
 from extrap_train.reconstruction.planner import Query
-from extrap_train.reconstruction.prior import prior_of
 from extrap_train.views import Camera, View, stack_cameras
 
 SIZE = 64

@@ -21,8 +21,8 @@ from extrap_train.data.sequences import Frame
 from extrap_train.data.synthetic import SyntheticScene, build_scene, render, trace
 from extrap_train.depth.stereo import PlaneSweepStereo
 from extrap_train.diffusion.generator import DiffusionGenerator
-from extrap_train.geometry.viewpoints import directions_from, scene_center
 from extrap_train.geometry.cameras import WorldFrame
+from extrap_train.geometry.viewpoints import directions_from, scene_center
 from extrap_train.reconstruction.cloud import cloud_of
 from extrap_train.reconstruction.completion import CompletionPipeline, complete, map_of_inputs
 from extrap_train.reconstruction.depth_prediction.inference import (
@@ -31,11 +31,10 @@ from extrap_train.reconstruction.depth_prediction.inference import (
 )
 from extrap_train.reconstruction.exact import ExactDepth
 from extrap_train.reconstruction.fusion import fuse_depths
-from extrap_train.reconstruction.global_map import GENERATED, GlobalMap, MapView
+from extrap_train.reconstruction.global_map import GENERATED, GlobalMap, MapView, prior_of
 from extrap_train.reconstruction.inputs import choose_frames, first_views, fit_world_frame
+from extrap_train.reconstruction.map_scores import cloud_scores
 from extrap_train.reconstruction.planner import orbit_queries
-from extrap_train.reconstruction.prior import prior_of
-from extrap_train.reconstruction.report import cloud_scores
 from extrap_train.tasks.completion_results import SUBDIVIDE
 from extrap_train.tasks.scene_model import open_model
 from extrap_train.views import View, stack_cameras, stack_poses

@@ -13,8 +13,7 @@ from PIL import Image
 from plyfile import PlyData
 
 from extrap_train.data.transforms_json import read_transforms
-from extrap_train.geometry.cameras import unproject_to_world
-from extrap_train.geometry.cameras import WorldFrame
+from extrap_train.geometry.cameras import WorldFrame, unproject_to_world
 from extrap_train.reconstruction.cloud import cloud_of
 from extrap_train.reconstruction.export import write_cloud, write_colmap, write_views
 from extrap_train.reconstruction.global_map import GENERATED, GIVEN, GlobalMap, Origin

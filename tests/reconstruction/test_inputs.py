@@ -12,6 +12,7 @@ from extrap_train.data.sequences import Frame
 from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError
 from extrap_train.geometry.viewpoints import scene_center
+from extrap_train.reconstruction.capture_check import check_poses
 from extrap_train.reconstruction.inputs import (
     check_cameras,
     choose_frames,
@@ -19,7 +20,6 @@ from extrap_train.reconstruction.inputs import (
     fit_world_frame,
     stand_where,
 )
-from extrap_train.reconstruction.pose_check import check_poses
 from extrap_train.views import Camera, View, stack_cameras
 
 NAMES = ["a", "b", "c"]

@@ -6,8 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from extrap_train.geometry.cameras import pixel_grid
-from extrap_train.geometry.cameras import coordinate_grid
+from extrap_train.geometry.cameras import coordinate_grid, pixel_grid
 from extrap_train.geometry.spline_flow import flow_at_pixels
 from extrap_train.geometry.warp.occlusion import is_occluded
 from extrap_train.geometry.warp.query_projection import (

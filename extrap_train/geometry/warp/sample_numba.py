@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from extrap_train.geometry.compiled import compiled
 from extrap_train.geometry.cameras import coordinate_grid
+from extrap_train.geometry.compiled import compiled
 from extrap_train.geometry.spline_flow import flow_at_pixels
 from extrap_train.geometry.warp import occlusion, sample
 from extrap_train.geometry.warp.occlusion_numba import draw_occlusion, project

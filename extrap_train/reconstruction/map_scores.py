@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrap_train.data.synthetic import SyntheticScene, surface_points
-from extrap_train.geometry.viewpoints import directions_from, scene_center
 from extrap_train.geometry.cameras import WorldFrame
+from extrap_train.geometry.viewpoints import directions_from, scene_center
 from extrap_train.metrics import psnr
 from extrap_train.reconstruction.cloud import PointCloud
 from extrap_train.reconstruction.cloud_metrics import (
@@ -22,8 +22,7 @@ from extrap_train.reconstruction.cloud_metrics import (
     sphere_coverage,
 )
 from extrap_train.reconstruction.completion import Step
-from extrap_train.reconstruction.global_map import GENERATED, GlobalMap
-from extrap_train.reconstruction.prior import prior_of
+from extrap_train.reconstruction.global_map import GENERATED, GlobalMap, prior_of
 from extrap_train.views import Camera
 
 TRUTH_POINTS = 60_000
