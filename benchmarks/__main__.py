@@ -8,7 +8,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from benchmarks.catalogue import Catalogue, lpips_weights_of, require_only_output
-from extrap_train.command_options import option_rows
+from extrap_train.command_line import option_rows
 from extrap_train.config import TableConfig
 from extrap_train.errors import InputError
 from extrap_train.exits import Ended, ends_in_one_line

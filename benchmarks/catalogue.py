@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import conf
-from extrap_train.command_options import CommandOptions, choices_of, open_own_folders
+from extrap_train.command_line import CommandLine, CommandOptions, choices_of, open_own_folders
 from extrap_train.config import (
     LPIPS_NETS,
     METRICS,
@@ -86,8 +86,7 @@ class Catalogue:
         from hydra import compose, initialize_config_module
         from hydra.errors import HydraException
 
-        from extrap_train.cli import PREP, register_schemas
-        from extrap_train.command_line import explain
+        from extrap_train.cli import PREP, explain, register_schemas
 
         register_schemas()
         words = [f"depth={name}", f"hydra.searchpath=[{','.join(f'file://{f}' for f in self.own)}]"]
@@ -123,7 +122,7 @@ def _compose(name: str, content: dict[str, Any], overrides: Sequence[str]) -> Ta
     from hydra.core.config_store import ConfigStore
     from hydra.errors import HydraException
 
-    from extrap_train.command_line import CommandLine, explain
+    from extrap_train.cli import explain
 
     words = CommandLine((), tuple(overrides)).prepared(TABLE)
     words += ["table@_global_=chosen_table", f"name={name}"]

@@ -1,5 +1,5 @@
 """The command line of every Hydra entry point: typed configuration in, one clear line out when it
-is wrong.
+is wrong; and `--help`.
 """
 
 import contextlib
@@ -7,8 +7,9 @@ import errno
 import functools
 import io
 import os
+import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -16,21 +17,31 @@ from typing import Any
 import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
+from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
+from omegaconf.errors import ConfigKeyError, OmegaConfBaseException, ValidationError
+from yaml import MarkedYAMLError, YAMLError
 
-from extrap_train.command_line import CommandLine, explain
-from extrap_train.command_options import (
+from extrap_train.command_line import (
     GROUPS,
+    CommandLine,
     CommandOptions,
     choices_of,
-    help_text,
+    format_rows,
     open_own_folders,
+    suggest,
+    unknown_option,
 )
-from extrap_train.config import TASKS, DataPrepConfig, TrainConfig, notes, validate
+from extrap_train.config import (
+    TASKS,
+    DataPrepConfig,
+    Option,
+    TrainConfig,
+    notes,
+    options_of,
+    validate,
+)
 from extrap_train.errors import InputError
 from extrap_train.exits import ends_in_one_line
 from extrap_train.store import Outcome
@@ -171,3 +182,91 @@ def _use_threads(threads: int | None) -> None:
         os.environ["OMP_NUM_THREADS"] = str(threads)
         if "numba" not in sys.modules:  # which refuses another number once its threads run
             os.environ["NUMBA_NUM_THREADS"] = str(threads)
+
+
+def explain(error: Exception, options: CommandOptions, overrides: Sequence[str]) -> str:
+    """What Hydra or OmegaConf has found, in our words where it is about an option or a choice."""
+    if isinstance(error, MissingConfigException) and "/" in (error.missing_cfg_file or ""):
+        group, _, name = str(error.missing_cfg_file).rpartition("/")
+        known = [known for known in error.options or () if not known.endswith("_schema")]
+        return f"{group}={name} is unknown{suggest(name, known)}; known: {', '.join(known)}"
+    if isinstance(error, YAMLError):
+        where = error.problem_mark if isinstance(error, MarkedYAMLError) else None
+        place = f"{where.name}, line {where.line + 1}" if where else "a file of options"
+        problem = error.problem if isinstance(error, MarkedYAMLError) else error
+        return f"{place}: is not valid YAML ({problem}); correct it"
+    if "ConfigKeyError" in str(error) and (
+        found := re.match(r"In '(.+)': .*\n(?:.*\n)*? *full_key: (\S+)", str(error))
+    ):
+        return f"{found[1]}.yaml: {unknown_option(found[2], options)}"
+    cause = error if isinstance(error, OmegaConfBaseException) else error.__cause__
+    if isinstance(cause, OmegaConfBaseException) and cause.full_key:
+        key = re.sub(r"\[\d+\]$", "", cause.full_key)
+        if isinstance(cause, ValidationError) and key in options.known:
+            return _wrong_value(key, cause, options, overrides)
+        if isinstance(cause, ConfigKeyError | AttributeError):
+            return unknown_option(key, options)
+    return " ".join(str(error).split("\n")[0].split())
+
+
+def _wrong_value(
+    key: str, cause: ValidationError, options: CommandOptions, overrides: Sequence[str]
+) -> str:
+    option = options.known[key]
+    given = next((word for word in overrides if word.startswith(f"{key}=")), key)
+    if given == f"{key}=null" and not option.may_be_null:
+        return f"{given}: cannot be null"
+    value_is_list = given.startswith(f"{key}=[")
+    if option.is_list and value_is_list:
+        return f"{given}: every value {option.item_must_be}"
+    return f"{given}: {option.must_be}"
+
+
+_HEAD = """\
+Usage: {program} category=NAME [GROUP=CHOICE ...] [OPTION=VALUE ...] [FLAG ...]
+"""
+_TAIL = """\
+Text is taken as typed. Quote it for the shell if it holds blanks or signs: 'scene=my scene (1)'.
+Two cases need quotes inside as well, as in {quoted}: a value that begins and
+ends with quotes of its own, and with -m one that holds a comma.
+
+Flags:
+  -m, --multirun      run every combination of values with commas between them: seed=0,1,2
+  --config-dir DIR    folder with choices of your own, as DIR/category/vase.yaml
+  --version           print the version
+  --hydra-help        flags of Hydra, which composes the options
+"""
+
+
+def help_text(options: CommandOptions, own_folders: Sequence[str] = ()) -> str:
+    """The whole page."""
+    parts = [_HEAD.format(program=options.program)]
+    if options.tasks:
+        parts.append("Tasks:\n" + format_rows(options.tasks.items()))
+    groups = [*options.groups, *options.file_groups]
+    choices = [(f"{group}=", " | ".join(choices_of(group, own_folders))) for group in groups]
+    choices.append(("matcher@depth.matcher=", "the matcher of depth=monocular: depth.matcher.NAME"))
+    parts.append("Choices:\n" + format_rows(choices))
+    for title, found in _sections(options):
+        parts.append(f"{title}:\n" + format_rows(option.row for option in found))
+    parts.append(_TAIL.format(quoted="""'scene="a,b"'"""))
+    return "\n".join(parts)
+
+
+def _sections(options: CommandOptions) -> Iterator[tuple[str, list[Option]]]:
+    """Options of the command itself, of each of its parts, and of each variant of a group."""
+    own = options_of(options.tree)
+    parts: dict[str, list[Option]] = {}
+    for name, option in own.items():
+        part = name.rpartition(".")[0]
+        if part.partition(".")[0] not in options.groups:
+            parts.setdefault(part, []).append(option)
+    for part, found in parts.items():
+        yield (f"Options of {part}" if part else "Options"), found
+    for group, variants in options.groups.items():
+        for variant in variants:
+            listed = [o for o in options_of(variant, f"{group}.").values() if o.declared.help]
+            own_values = f"{group} ({group}= sets values of its own)"
+            chosen = f"{group}={variant.name}" if len(variants) > 1 else own_values  # type: ignore[attr-defined]
+            if listed:
+                yield f"Options of {chosen}", listed

@@ -1,48 +1,139 @@
-"""The words of a command line: put into Hydra's grammar, and what is wrong with them, in one line.
+"""The options that a Hydra command has, and the words of a command line put into Hydra's grammar.
 
 Hydra parses values before it knows their options' types: `run=1.10` would become 1.1, and a path
 with a blank, an umlaut or `=` a syntax error. A text option holds what was typed, so its value is
 quoted here wherever Hydra would read it as anything else.
 """
 
+import difflib
+import os
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+import sys
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from importlib.resources import files
+from pathlib import Path
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Quote, QuotedString
-from hydra.errors import HydraException, MissingConfigException
-from omegaconf.errors import ConfigKeyError, OmegaConfBaseException, ValidationError
-from yaml import MarkedYAMLError, YAMLError
-
-from extrap_train.command_options import CommandOptions, choices_of, suggest
-from extrap_train.config import Option
+from extrap_train import config as schema
+from extrap_train.config import Option, options_of
 from extrap_train.errors import InputError
 
+GROUPS: dict[str, list[type]] = {
+    "category": [schema.CategoryConfig],
+    "data": [schema.SyntheticConfig, schema.Co3dConfig],
+    "depth": [
+        schema.DatasetDepthConfig,
+        schema.StereoConfig,
+        schema.Mast3rConfig,
+        schema.MonocularConfig,
+        schema.OwnDepthConfig,
+    ],
+    "matcher": [
+        schema.FlowMatcherConfig,
+        schema.LoftrMatcherConfig,
+        schema.AlikedMatcherConfig,
+        schema.OwnMatcherConfig,
+    ],
+    "launcher": [schema.LocalConfig, schema.SlurmConfig],
+    "model": [schema.ModelConfig],
+    "logger": [schema.LoggerConfig],
+}
+"""Variants of each group; one alone has files that differ in values only."""
 
-def explain(error: Exception, options: CommandOptions, overrides: Sequence[str]) -> str:
-    """What Hydra or OmegaConf has found, in our words where it is about an option or a choice."""
-    if isinstance(error, MissingConfigException) and "/" in (error.missing_cfg_file or ""):
-        group, _, name = str(error.missing_cfg_file).rpartition("/")
-        known = [known for known in error.options or () if not known.endswith("_schema")]
-        return f"{group}={name} is unknown{suggest(name, known)}; known: {', '.join(known)}"
-    if isinstance(error, YAMLError):
-        where = error.problem_mark if isinstance(error, MarkedYAMLError) else None
-        place = f"{where.name}, line {where.line + 1}" if where else "a file of options"
-        problem = error.problem if isinstance(error, MarkedYAMLError) else error
-        return f"{place}: is not valid YAML ({problem}); correct it"
-    if "ConfigKeyError" in str(error) and (
-        found := re.match(r"In '(.+)': .*\n(?:.*\n)*? *full_key: (\S+)", str(error))
-    ):
-        return f"{found[1]}.yaml: {unknown_option(found[2], options)}"
-    cause = error if isinstance(error, OmegaConfBaseException) else error.__cause__
-    if isinstance(cause, OmegaConfBaseException) and cause.full_key:
-        key = re.sub(r"\[\d+\]$", "", cause.full_key)
-        if isinstance(cause, ValidationError) and key in options.known:
-            return _wrong_value(key, cause, options, overrides)
-        if isinstance(cause, ConfigKeyError | AttributeError):
-            return unknown_option(key, options)
-    return " ".join(str(error).split("\n")[0].split())
+
+@dataclass(frozen=True)
+class CommandOptions:
+    """The options of one command."""
+
+    program: str
+    """How the command is started."""
+    config_name: str
+    """Its file in `conf/`."""
+    tree: type
+    tasks: Mapping[str, str]
+    """What each value of `task=` does; empty for a command of one task."""
+    file_groups: tuple[str, ...] = ()
+    """Groups of files that set options of any kind."""
+
+    @cached_property
+    def groups(self) -> dict[str, list[type]]:
+        """Those of `GROUPS` that its tree has."""
+        own = {each.name for each in fields(self.tree)}
+        return {group: variants for group, variants in GROUPS.items() if group in own}
+
+    @cached_property
+    def known(self) -> dict[str, Option]:
+        """Every option, those of all variants among them."""
+        nested = {"depth.matcher": GROUPS["matcher"]} if "depth" in self.groups else {}
+        found = dict(options_of(self.tree))
+        for group, variants in {**self.groups, **nested}.items():
+            for variant in variants:
+                found |= options_of(variant, f"{group}.")
+        return found
+
+    def find(self, key: str) -> Option | None:
+        """The option that a key sets; an entry of a mapping is set by a longer key."""
+        if key in self.known:
+            return self.known[key]
+        above = (option for name, option in self.known.items() if key.startswith(f"{name}."))
+        return next((option for option in above if option.kind is dict), None)
+
+    def has_options_below(self, key: str) -> bool:
+        """Whether the key names a part of the tree instead of an option."""
+        return any(name.startswith(f"{key}.") for name in self.known)
+
+    def variants_with(self, key: str) -> list[str]:
+        """The choices, as they are typed, that have an option which others of the group lack."""
+        group = key.partition(".")[0]
+        variants = self.groups.get(group, [])
+        found = [v for v in variants if key in options_of(v, f"{group}.")]
+        return [f"{group}={v.name}" for v in found] if len(variants) > 1 else []  # type: ignore[attr-defined]
+
+    def suggest(self, key: str) -> str:
+        """`; did you mean …?` where an option or a group looks like it."""
+        return suggest(key, [*self.known, *self.groups, *self.file_groups])
+
+
+def choices_of(group: str, own_folders: Sequence[str] = ()) -> list[str]:
+    """Names of the files of a group, in the package and in folders of the user's own."""
+    places = [Path(str(files("conf"))), *map(Path, own_folders)]
+    found = ((place / group, file) for place in places for file in (place / group).rglob("*.yaml"))
+    return sorted({file.relative_to(folder).with_suffix("").as_posix() for folder, file in found})
+
+
+def open_own_folders(names: Sequence[str]) -> list[str]:
+    """Absolute paths of the folders given with `--config-dir`; their modules can then be imported.
+
+    Worker processes import from them, too. InputError for one that is not there.
+    """
+    folders = [str(Path(name).resolve()) for name in names]
+    for name, folder in zip(names, folders, strict=True):
+        if not Path(folder).is_dir():
+            raise InputError(f"--config-dir {name}: no such folder")
+        sys.path.insert(0, folder)
+    if folders:
+        paths = [*folders, *filter(None, [os.environ.get("PYTHONPATH")])]
+        os.environ["PYTHONPATH"] = os.pathsep.join(paths)
+    return folders
+
+
+def suggest(given: str, known: Collection[str]) -> str:
+    """`; did you mean …?` with the known name that looks most like the given one."""
+    near = difflib.get_close_matches(given, [name for name in known if name != given], n=1)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+def option_rows(tree: type) -> str:
+    """A line for every option of a tree, as `--help` shows it."""
+    return format_rows(o.row for o in options_of(tree).values() if o.declared.help)
+
+
+def format_rows(rows: Iterable[tuple[str, str]]) -> str:
+    """Two columns."""
+    listed = list(rows)
+    width = min(_WIDEST, max(len(name) for name, _ in listed))
+    return "".join(f"  {name:<{width}}  {meaning}\n" for name, meaning in listed)
 
 
 def unknown_option(key: str, options: CommandOptions) -> str:
@@ -52,19 +143,6 @@ def unknown_option(key: str, options: CommandOptions) -> str:
     return f"there is no option {key}{options.suggest(key)}; see --help"
 
 
-def _wrong_value(
-    key: str, cause: ValidationError, options: CommandOptions, overrides: Sequence[str]
-) -> str:
-    option = options.known[key]
-    given = next((word for word in overrides if word.startswith(f"{key}=")), key)
-    if given == f"{key}=null" and not option.may_be_null:
-        return f"{given}: cannot be null"
-    value_is_list = given.startswith(f"{key}=[")
-    if option.is_list and value_is_list:
-        return f"{given}: every value {option.item_must_be}"
-    return f"{given}: {option.must_be}"
-
-
 _FLAGS_WITH_VALUE = (
     *("--config-dir", "-cd", "--config-path", "-cp", "--config-name", "-cn"),
     *("--package", "-p", "--experimental-rerun", "--cfg", "-c", "--info", "-i"),
@@ -72,6 +150,9 @@ _FLAGS_WITH_VALUE = (
 _WORD = re.compile(r"(?P<mark>~|\+{0,2})(?P<key>[^=]*)(?:=(?P<value>.*))?", re.DOTALL)
 _SWEEP = re.compile(r"(choice|range|interval|glob|shuffle|sort|tag)\(.*\)", re.DOTALL)
 """What a value of several jobs may be besides values with commas between them."""
+_WIDEST = 44
+"""Width of the first column of `--help`, where names are that long."""
+_NO_VALUE = object()
 
 
 @dataclass(frozen=True)
@@ -132,11 +213,12 @@ class CommandLine:
         if mark == "~" or value is None:
             raise InputError(f"{word}: give a value, as {key}=VALUE")
         if key != option.name:  # an entry of a mapping, new or not
-            is_text = option.has_text_entries or _parse(key, value) is None
+            is_text = option.has_text_entries or _parse(key, value) is _NO_VALUE
             return f"++{key}={self._text(value, key) if is_text else value}"
         if option.kind is str:
             return f"{key}={self._texts(value, option)}"
-        _require_grammar(key, value, option)
+        if _parse(key, value) is _NO_VALUE:
+            raise InputError(f"{key}={value}: {option.must_be}")
         return f"{key}={value}"
 
     def _choice(self, group: str, value: str | None, word: str) -> str:
@@ -170,6 +252,8 @@ class CommandLine:
 
     def _text(self, value: str, key: str) -> str:
         """The value as Hydra reads this text, and no number, list or interpolation, from it."""
+        from hydra.core.override_parser.types import Quote, QuotedString
+
         parsed = _parse(key, value)
         if value == "null" or isinstance(parsed, QuotedString) or not value:
             return value
@@ -201,18 +285,15 @@ def _without_interpolation(text: str) -> str:
 
 
 def _parse(key: str, value: str) -> object:
-    """The value as Hydra's grammar has it; None where it is not a value."""
+    """The value as Hydra's grammar has it; `_NO_VALUE` where it is none."""
+    # Slow, and `benchmark list` does without.
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
     try:
         return OverridesParser.create().parse_override(f"{key}={value}")._value
     except HydraException:
-        return None
-
-
-def _require_grammar(key: str, value: str, option: Option) -> None:
-    try:
-        OverridesParser.create().parse_override(f"{key}={value}")
-    except HydraException:
-        raise InputError(f"{key}={value}: {option.must_be}") from None
+        return _NO_VALUE
 
 
 def _unknown(key: str, value: str | None, options: CommandOptions) -> str:

@@ -11,7 +11,7 @@ import pytest
 from data_prep.__main__ import main as prepare
 from extrap_train.__main__ import main
 from extrap_train.cli import PREP, TRAIN
-from extrap_train.command_options import CommandOptions
+from extrap_train.command_line import CommandOptions
 
 Said = Callable[..., str]
 _COMMANDS = pytest.mark.parametrize(("command", "options"), [(main, TRAIN), (prepare, PREP)])

@@ -33,7 +33,6 @@ _ORDER = (
     "extrap_train.runs",
     "extrap_train.tasks",
     "extrap_train.sweep",
-    "extrap_train.command_options",
     "extrap_train.command_line",
     "extrap_train.cli",
     "data_prep",

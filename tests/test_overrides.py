@@ -13,8 +13,7 @@ from omegaconf import OmegaConf
 from benchmarks.catalogue import TABLE
 from extrap_train.__main__ import main
 from extrap_train.cli import TRAIN
-from extrap_train.command_line import CommandLine
-from extrap_train.command_options import CommandOptions
+from extrap_train.command_line import CommandLine, CommandOptions
 from extrap_train.config import TrainConfig
 
 

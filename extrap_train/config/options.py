@@ -75,6 +75,15 @@ class Option:
             return f"from {_plain(low)} to {_plain(high)}"
         return f"at least {_plain(low)}" if math.isfinite(low) else ""
 
+    @property
+    def row(self) -> tuple[str, str]:
+        """Its line in a `--help`: name and default; meaning, unit and range."""
+        limits = [self.declared.unit, " | ".join(self.declared.known) or self.range]
+        said = ", ".join(filter(None, limits))
+        return f"{self.name}={_shown(self.default)}", self.declared.help + (
+            f" ({said})" if said else ""
+        )
+
     def check(self, value: Any) -> None:
         """InputError where a value is out of the range, not among the known words or repeated."""
         items = [*value] if isinstance(value, list | tuple | dict) else [value]
@@ -148,6 +157,15 @@ def _declared(tree: type, name: str) -> Declared:
             found: Declared = own.metadata["option"]
             return found
     return Declared()
+
+
+def _shown(value: Any) -> str:
+    """A default as it is typed."""
+    if value is None or isinstance(value, bool):
+        return str(value).lower().replace("none", "null")
+    if isinstance(value, list):
+        return f"[{','.join(map(_shown, value))}]"
+    return "" if value == MISSING else f"{value}"
 
 
 def _plain(number: int | float) -> str:
