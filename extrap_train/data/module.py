@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 from extrap_train.config import TrainConfig
 from extrap_train.data.examples import Example, ExampleReader, linspace_indices, mirror
 from extrap_train.geometry.warp import compute_warp
-from extrap_train.jobs.fork_server import start_fork_server
+from extrap_train.jobs import start_fork_server
 from extrap_train.views import PackedBatch, PairBatch
 
 _PRELOAD = ("extrap_train.data.module",)
