@@ -118,7 +118,7 @@ def _add_config_dir(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="DIR",
-        help="folder with your own method/ and table/ and the Python files of the methods",
+        help="folder with your own method/, table/, metric/, depth/, matcher/ and Python files",
     )
 
 

