@@ -19,6 +19,7 @@ from extrap_train.store.atomic import partial_path
 pytestmark = pytest.mark.slow  # starting a dozen processes takes more than what they do
 
 SEQUENCES, FRAMES = 8, 12
+_PAGE_BYTES = os.sysconf("SC_PAGESIZE")
 START_SECONDS = 900
 """More than two workers take to their first result, on a busy machine, too."""
 
@@ -137,8 +138,12 @@ def test_a_second_run_on_the_same_folder_finds_everything_done(
 def test_a_full_disk_is_one_line_and_the_same_command_goes_on(
     photographs: Path, undisturbed: dict[str, bytes], tmp_path: Path
 ) -> None:
-    """A file system in memory, which this process and its children alone can see."""
-    small, whole = "size=3m,mode=755", "remount,size=64m"
+    """A file system in memory, which this process and its children alone can see, with half of the
+    pages that the sequences need.
+    """
+    sequences = [x for name, x in undisturbed.items() if name.startswith(("frames/", "pairs/"))]
+    pages = sum(-(-len(content) // _PAGE_BYTES) for content in sequences)
+    small, whole = f"size={pages // 2 * _PAGE_BYTES},mode=755", "remount,size=64m"
     if subprocess.run(["unshare", "-rm", "mount", "-t", "tmpfs", "x", str(tmp_path)]).returncode:
         pytest.skip("this machine lets nobody mount a file system of their own")
     output = tmp_path / "disk"
