@@ -17,14 +17,14 @@ _SAME_SURFACE = 0.02
 """Relative difference of depth below which a resampled map is interpolated."""
 
 
-def combine(parts: Sequence[T], join: Callable[[Sequence[Tensor]], Tensor]) -> T:
-    """One value from several alike: tensors, in dataclasses of any depth, are joined.
+def combine(parts: Sequence[T], join: Callable[[list[Tensor]], Tensor]) -> T:
+    """One value from several alike: tensors, in dataclasses of any depth, are joined (`torch.cat`).
 
     Whatever is not a tensor is taken from the first.
     """
     first: Any = parts[0]
     if isinstance(first, Tensor):
-        return cast(T, join(cast(Sequence[Tensor], parts)))
+        return cast(T, join(cast(list[Tensor], [*parts])))
     if not is_dataclass(first) or isinstance(first, type):
         return cast(T, first)
     names = [field.name for field in fields(first)]
@@ -101,7 +101,7 @@ def stack_cameras(cameras: Sequence[Camera]) -> Camera:
     sizes = {(camera.height, camera.width) for camera in cameras}
     if len(sizes) != 1:
         raise ValueError(f"cameras of different image sizes cannot be stacked: {sorted(sizes)}")
-    return combine(cameras, lambda tensors: torch.stack(list(tensors)))
+    return combine(cameras, torch.stack)
 
 
 def stack_poses(cameras: Sequence[Camera]) -> Camera:

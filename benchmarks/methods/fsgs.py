@@ -11,7 +11,7 @@ from torch import Tensor
 from benchmarks.methods.threedgs import MonocularMethod
 from extrap_train.config.options import option
 from extrap_train.errors import InputError
-from extrap_train.gaussians.gaussian_model import GaussianParameters, from_tensors
+from extrap_train.gaussians.gaussian_model import GaussianParameters
 from extrap_train.gaussians.init import nearest_neighbours
 from extrap_train.gaussians.losses import pearson_depth_loss
 from extrap_train.gaussians.rasterize import Drawing
@@ -137,8 +137,8 @@ def unpool(
     count = len(source)
     quats = torch.zeros(count, 4).to(means)
     quats[:, 0] = 1
-    new = from_tensors(
-        {
+    new = GaussianParameters(
+        **{
             "means": (means[source] + means[target]) / 2,
             "log_scales": parameters.log_scales.detach()[target],
             "quats": quats,

@@ -12,11 +12,11 @@ from benchmarks.methods.threedgs import ThreeDgs
 from extrap_train.config.options import option
 from extrap_train.depth import DepthMap
 from extrap_train.gaussians.density import rotation_matrices
-from extrap_train.gaussians.init import Points, join_points, pixel_points
+from extrap_train.gaussians.init import Points, pixel_points
 from extrap_train.gaussians.recipe import Recipe
 from extrap_train.gaussians.training_scene import TrainingScene
 from extrap_train.geometry.cameras import project, unproject_to_world
-from extrap_train.views import Camera, View
+from extrap_train.views import Camera, View, combine
 
 _STEADY, _LOOSE = 1.0, 100.0
 """Step of a mean at full confidence, and at none."""
@@ -36,7 +36,8 @@ class InstantSplatRecipe(Recipe):
         views, options = self.scene.views, self.options
         maps = self.scene.depth_maps(self.scene.depth_source)
         wanted = unique_pixels(views, maps, options.covisibility)
-        found = join_points([pixel_points(*each) for each in zip(views, maps, wanted, strict=True)])
+        parts = [pixel_points(*each) for each in zip(views, maps, wanted, strict=True)]
+        found = combine(parts, torch.cat)
         points = found.at_most(
             min(options.init_points, options.max_gaussians), self.generator
         )  # fmt: skip

@@ -42,9 +42,9 @@ class DepthMap:
     depth: Float[Tensor, "h w"]
     confidence: Float[Tensor, "h w"]
 
-    def reliable(self, least_confidence: float = RELIABLE_CONFIDENCE) -> Float[Tensor, "h w"]:
-        """Depth, and 0 (unknown) where the confidence is lower."""
-        return torch.where(self.confidence >= least_confidence, self.depth, 0)
+    def reliable(self) -> Float[Tensor, "h w"]:
+        """Depth, and 0 (unknown) where the confidence is below `RELIABLE_CONFIDENCE`."""
+        return torch.where(self.confidence >= RELIABLE_CONFIDENCE, self.depth, 0)
 
     def resized(self, height: int, width: int) -> "DepthMap":
         """The map at another size: interpolated on a surface, by the nearest pixel at its edges."""

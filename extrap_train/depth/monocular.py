@@ -118,7 +118,7 @@ class MonocularDepth:
                 f"{LEAST_POINTS} that depth=monocular needs for scale and shift; add photographs "
                 "or choose another depth.matcher"
             )
-        points = combine(parts, lambda tensors: torch.cat(list(tensors)))
+        points = combine(parts, torch.cat)
         predicted = self.network.inverse_depth(view.image)
         at_points = sample_pixels(predicted[None], points.pixels)[0]
         line = robust_line(at_points, 1 / points.depth, points.weights)

@@ -62,7 +62,7 @@ class Conditioning:
         if plain_zeros:
             zeros = torch.zeros_like(self.latents), torch.zeros_like(self.token_weight)
             null = replace(self, latents=zeros[0], token_weight=zeros[1])
-        return combine([self, null], lambda tensors: torch.cat(list(tensors)))
+        return combine([self, null], torch.cat)
 
 
 def _zeroed(

@@ -88,7 +88,7 @@ class DiffusionGenerator:
             raise ValueError(f"{len(names)} names for {len(queries.world_to_cam)} queries")
         batches = [slice(at, at + self.batch_size) for at in range(0, len(names), self.batch_size)]
         parts = [self._generate(references, queries[at], names[at], seed) for at in batches]
-        whole = combine(parts, lambda tensors: torch.cat(list(tensors)))
+        whole = combine(parts, torch.cat)
         chosen = [row for part in parts for row in part.references]
         return GeneratedViews(whole.images, whole.cameras, whole.warp, chosen)
 

@@ -3,12 +3,13 @@
 import math
 from dataclasses import dataclass
 
+import roma
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from extrap_train.gaussians.gaussian_model import GaussianParameters, from_tensors
+from extrap_train.gaussians.gaussian_model import GaussianParameters
 from extrap_train.gaussians.gaussian_options import GaussianOptions
 from extrap_train.gaussians.optimiser import GaussianOptimiser
 from extrap_train.gaussians.rasterize import Drawing
@@ -103,18 +104,12 @@ def split_in_two(parameters: GaussianParameters, generator: torch.Generator) -> 
     offset = rotation_matrices(twice["quats"]) @ (twice["log_scales"].exp() * drawn)[..., None]
     twice["means"] = twice["means"] + offset[..., 0]
     twice["log_scales"] = twice["log_scales"] - math.log(SPLIT_SHRINK)
-    return from_tensors(twice)
+    return GaussianParameters(**twice)
 
 
 def rotation_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
     """Rotations of quaternions (w, x, y, z) of any length."""
-    w, x, y, z = functional.normalize(quats, dim=-1).unbind(-1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+    return roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(functional.normalize(quats, dim=-1)))
 
 
 @torch.no_grad()

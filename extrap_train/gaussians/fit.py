@@ -10,7 +10,7 @@ from torch import Tensor
 from extrap_train.depth import DepthSource
 from extrap_train.errors import InputError
 from extrap_train.gaussians.density import GrowthStatistics
-from extrap_train.gaussians.gaussian_model import GaussianParameters, Gaussians, from_tensors
+from extrap_train.gaussians.gaussian_model import GaussianParameters, Gaussians
 from extrap_train.gaussians.gaussian_options import GaussianOptions, Schedule, exponential
 from extrap_train.gaussians.init import Points, parameters_from_points
 from extrap_train.gaussians.optimiser import GaussianOptimiser, ModuleOptimiser, is_finite
@@ -18,7 +18,7 @@ from extrap_train.gaussians.recipe import Recipe, Training
 from extrap_train.gaussians.training_scene import training_scene
 from extrap_train.geometry.cameras import unproject_to_world
 from extrap_train.terminal import track
-from extrap_train.views import Camera, View
+from extrap_train.views import Camera, View, combine
 
 WIDEST_START = 0.05
 """Largest initial width as a share of the distance to the nearest input camera: among a few hundred
@@ -120,8 +120,7 @@ def fit(recipe: Recipe, points: Points | None = None, show_progress: bool = Fals
         _check(training, modules)
         recipe.adapt(training)  # clone, split, prune and reset opacities, section 5.2
     _check(training, modules)
-    learnt = optimiser.parameters.tensors()
-    return Fit(from_tensors({name: value.detach() for name, value in learnt.items()}), recipe)
+    return Fit(combine([optimiser.parameters], lambda tensors: tensors[0].detach()), recipe)
 
 
 def _begin(recipe: Recipe, points: Points) -> Training:

@@ -1,7 +1,6 @@
 """A scene of 3D Gaussians: as it is drawn, as an optimiser moves it, and its colours."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -108,7 +107,7 @@ class GaussianParameters:
         return len(self.means)
 
     def __getitem__(self, rows: Bool[Tensor, " n"] | Int[Tensor, " m"]) -> "GaussianParameters":
-        return from_tensors({name: value[rows] for name, value in self.tensors().items()})
+        return combine([self], lambda tensors: tensors[0][rows])
 
     @property
     def scales(self) -> Float[Tensor, "n 3"]:
@@ -126,14 +125,9 @@ class GaussianParameters:
 
     def to(self, device: torch.device | str) -> "GaussianParameters":
         """The same parameters on another device."""
-        return from_tensors({name: value.to(device) for name, value in self.tensors().items()})
+        return combine([self], lambda tensors: tensors[0].to(device))
 
     def gaussians(self) -> Gaussians:
         """The values that are drawn; gradients lead back to the parameters."""
         sh = torch.cat([self.sh_dc, self.sh_rest], 1)
         return Gaussians(self.means, self.quats, self.scales, self.opacities, sh)
-
-
-def from_tensors(tensors: Mapping[str, Tensor]) -> GaussianParameters:
-    """The inverse of `GaussianParameters.tensors`."""
-    return GaussianParameters(**tensors)

@@ -20,8 +20,13 @@ from torch import Tensor
 from extrap_train.depth import DepthMap
 from extrap_train.errors import InputError
 from extrap_train.gaussians.gaussian_model import GaussianParameters, rgb_to_sh
-from extrap_train.geometry.cameras import unproject_to_world
-from extrap_train.geometry.epipolar import epipolar_lines, fundamental_matrix, homogeneous
+from extrap_train.geometry.cameras import transform, unproject_to_world
+from extrap_train.geometry.epipolar import (
+    epipolar_lines,
+    fundamental_matrix,
+    homogeneous,
+    viewing_rays,
+)
 from extrap_train.matching.sift import (
     Features,
     descriptor_distance,
@@ -29,7 +34,7 @@ from extrap_train.matching.sift import (
     match_mutual,
     root_sift,
 )
-from extrap_train.views import Camera, View
+from extrap_train.views import Camera, View, combine
 
 _MIN_SPACING = 1e-7**0.5
 FARTHEST = 10.0
@@ -53,22 +58,13 @@ class Points:
         return len(self.positions)
 
     def __getitem__(self, index: Int[Tensor, " m"] | Bool[Tensor, " n"]) -> "Points":
-        return Points(self.positions[index], self.colors[index], self.confidence[index])
+        return combine([self], lambda tensors: tensors[0][index])
 
     def at_most(self, count: int, generator: torch.Generator) -> "Points":
         """All of them, or an even draw of `count`."""
         if len(self) <= count:
             return self
         return self[torch.randperm(len(self), generator=generator)[:count].sort().values]
-
-
-def join_points(parts: Sequence[Points]) -> Points:
-    """All the points of several sets."""
-    return Points(
-        torch.cat([part.positions for part in parts]),
-        torch.cat([part.colors for part in parts]),
-        torch.cat([part.confidence for part in parts]),
-    )
 
 
 def random_points(cameras: Sequence[Camera], count: int, generator: torch.Generator) -> Points:
@@ -88,10 +84,8 @@ def random_points(cameras: Sequence[Camera], count: int, generator: torch.Genera
         nearest = float(expected[index]) or NEAREST_UNKNOWN * reach
         depth = nearest * (FARTHEST * reach / nearest) ** place[mine, 2]
         pixels = place[mine, :2] * torch.tensor([camera.width, camera.height])
-        homogeneous = torch.cat([pixels, torch.ones(len(pixels), 1)], 1)
-        rays = homogeneous @ torch.linalg.inv(camera.intrinsics).T
-        cam_to_world = camera.cam_to_world
-        positions[mine] = (rays * depth[:, None]) @ cam_to_world[:3, :3].T + cam_to_world[:3, 3]
+        rays = viewing_rays(pixels, camera)
+        positions[mine] = transform(camera.cam_to_world, rays * depth[:, None])
     return Points(positions, torch.rand(count, 3, generator=generator), torch.ones(count))
 
 

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from extrap_train.gaussians.gaussian_model import GaussianParameters, from_tensors
+from extrap_train.gaussians.gaussian_model import GaussianParameters
 from extrap_train.gaussians.gaussian_options import Schedule, exponential
 
 _MOMENTS = ("exp_avg", "exp_avg_sq")
@@ -26,7 +26,7 @@ class GaussianOptimiser:
     def parameters(self) -> GaussianParameters:
         """The parameters as they are now: the graph's leaves."""
         groups = self._adam.param_groups
-        return from_tensors({group["name"]: group["params"][0] for group in groups})
+        return GaussianParameters(**{group["name"]: group["params"][0] for group in groups})
 
     def __len__(self) -> int:
         return len(self.parameters)

@@ -49,8 +49,6 @@ def announce_compilation() -> Iterator[None]:
         yield
 
 
-Backend = Literal["numba", "gsplat"]
-"""What draws: ours on the CPU, or gsplat on CUDA."""
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 _MIN_DIVISOR = 1e-10
 

@@ -18,7 +18,6 @@ from extrap_train.gaussians.gaussian_options import (
 )
 from extrap_train.gaussians.init import (
     Points,
-    join_points,
     pixel_points,
     random_points,
     triangulate_points,
@@ -27,7 +26,7 @@ from extrap_train.gaussians.losses import photometric_loss, prepare_truth
 from extrap_train.gaussians.optimiser import GaussianOptimiser
 from extrap_train.gaussians.rasterize import Drawing, draw, rasterizer
 from extrap_train.gaussians.training_scene import TrainingScene
-from extrap_train.views import Camera
+from extrap_train.views import Camera, combine
 
 
 @dataclass
@@ -79,12 +78,14 @@ class Recipe:
             case "dense":
                 maps = self.scene.depth_maps(self.scene.depth_source)
                 parts = [pixel_points(*pair) for pair in zip(views, maps, strict=True)]
-                points = join_points(parts).at_most(options.init_points, self.generator)
+                points = combine(parts, torch.cat)
+                points = points.at_most(options.init_points, self.generator)
                 self.scene.record["init"] = f"{len(points)} points of the depth source"
             case _:
                 found = triangulate_points(views)
                 missing = max(options.init_points - len(found), 0)
-                points = join_points([found, random_points(cameras, missing, self.generator)])
+                drawn = random_points(cameras, missing, self.generator)
+                points = combine([found, drawn], torch.cat)
                 self.scene.record["init"] = (
                     f"{len(found)} points triangulated from the inputs, {missing} random"
                 )

@@ -46,7 +46,7 @@ def cloud_of(known: GlobalMap, *, votes: bool = True, subdivide: int = 1) -> Poi
     """
     return combine(
         [_points_of(known, index, votes, subdivide) for index in range(len(known))],
-        lambda tensors: torch.cat(list(tensors)),
+        torch.cat,
     )
 
 

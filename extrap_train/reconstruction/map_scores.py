@@ -1,14 +1,10 @@
 """Numbers about a completed map: drift, consistency between views, coverage, 3-D scores."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from extrap_train.data.synthetic import SyntheticScene, surface_points
 from extrap_train.geometry.cameras import WorldFrame
@@ -23,7 +19,6 @@ from extrap_train.reconstruction.cloud_metrics import (
 )
 from extrap_train.reconstruction.completion import Step
 from extrap_train.reconstruction.global_map import GENERATED, GlobalMap, prior_of
-from extrap_train.views import Camera
 
 TRUTH_POINTS = 60_000
 SEEN_WITHIN_RAD = np.radians(20)
@@ -46,10 +41,15 @@ def cloud_scores(
 
 
 def drift(steps: Sequence[Step], known: GlobalMap) -> dict[str, float | int | None]:
-    """Where branches met: the largest of their errors, as a share of the scene's size."""
+    """Where branches met: the largest of their errors, as a share of the scene's size.
+
+    That is the median width of the pictures at the scene's centre, in scene units.
+    """
     errors = [step.loop_error for step in steps if step.loop_error is not None]
     center = torch.from_numpy(scene_center(known.cameras)).float()
-    size = scene_size(known.cameras, center)
+    cameras = known.cameras
+    z = cameras.world_to_cam[:, 2, :3] @ center + cameras.world_to_cam[:, 2, 3]
+    size = float((z * cameras.width / cameras.intrinsics[:, 0, 0]).median())
     return {
         "meetings": len(errors),
         "largest_error": max(errors) / size if errors else None,
@@ -83,17 +83,3 @@ def coverage_of(known: GlobalMap) -> dict[str, float]:
         "inputs": sphere_coverage(directions[given], float(SEEN_WITHIN_RAD)),
         "completed": sphere_coverage(directions, float(SEEN_WITHIN_RAD)),
     }
-
-
-def step_records(steps: Sequence[Step]) -> list[dict[str, Any]]:
-    """The steps as JSON holds them."""
-    return [asdict(step) for step in steps]
-
-
-def scene_size(cameras: Camera, center: Float[Tensor, "3"]) -> float:
-    """Width of the pictures at the scene's centre, in scene units: the unit of drift."""
-    z = cameras.world_to_cam[:, 2, :3] @ center + cameras.world_to_cam[:, 2, 3]
-    width = z * cameras.width / cameras.intrinsics[:, 0, 0]
-    size = float(width.median())
-    assert math.isfinite(size)
-    return size

@@ -29,7 +29,6 @@ from extrap_train.reconstruction.map_scores import (
     cloud_scores,
     coverage_of,
     drift,
-    step_records,
     view_consistency,
 )
 from extrap_train.reconstruction.mesh import write_mesh
@@ -71,10 +70,9 @@ def write_completed(
 ) -> None:
     """Write everything, `summary.json` last."""
     started = time.perf_counter()
-    cloud = _sure(
-        cloud_of(done.known, votes=config.complete.confidence.votes, subdivide=SUBDIVIDE),
-        config.complete.confidence.least_confidence,
-    )
+    confidence = config.complete.confidence
+    cloud = cloud_of(done.known, votes=confidence.votes, subdivide=SUBDIVIDE)
+    cloud = cloud[cloud.confidence >= confidence.least_confidence]
     outside = replace(cloud, points=done.world.points_outside(cloud.points))
     write_cloud(outside, folder / "cloud.ply")
     write_views(done.known, done.world, folder)
@@ -107,7 +105,7 @@ def write_completed(
         "consistency_db": view_consistency(done.known),
         "sphere_coverage": coverage_of(done.known),
         "seconds": done.seconds,
-        "steps": step_records(done.steps),
+        "steps": [asdict(step) for step in done.steps],
         "provenance": provenance(config, {"scene": config.scene or ""}),
     }
     write_summary(folder, summary)
@@ -159,10 +157,6 @@ def _fit_splats(
 
 def _count(known: GlobalMap, kind: str) -> int:
     return sum(view.origin.kind == kind for view in known.views)
-
-
-def _sure(cloud: PointCloud, least: float) -> PointCloud:
-    return cloud[cloud.confidence >= least]
 
 
 def _metrics(done: Completed, cloud: PointCloud) -> dict[str, dict[str, float]] | None:

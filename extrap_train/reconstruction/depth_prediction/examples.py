@@ -82,7 +82,7 @@ def draw_examples(
             nearest = known.nearest(view.camera, options.edges + 1)
             others = [other for other in nearest if other != index]
             recorder(known, view.view, others[: options.edges])
-    return combine(recorder.examples, lambda tensors: torch.cat(list(tensors)))
+    return combine(recorder.examples, torch.cat)
 
 
 @dataclass(frozen=True)
