@@ -69,10 +69,10 @@ def open_generator(
 ) -> DiffusionGenerator:
     """The generator of a model folder, of a packaged model, or of a published checkpoint.
 
-    `config` describes a published checkpoint, which does not say itself what it is. Without
-    `sampler` it samples as the model recommends. It runs where and in what the commands do: on the
-    GPU where there is one, in bfloat16 where the processor has units for it. Raises InputError for
-    weights that cannot be used.
+    `config` describes a published checkpoint; without it, family and size are recognised by the
+    tensors. Without `sampler` it samples as the model recommends. It runs where and in what the
+    commands do: on the GPU where there is one, in bfloat16 where the processor has units for it.
+    Raises InputError for weights that cannot be used.
     """
     model = open_model(weights, adapter, config).to(device or fastest_device())
     return DiffusionGenerator(model, sampler or model.config.sampler, precision=precision)

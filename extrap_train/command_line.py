@@ -192,7 +192,10 @@ class CommandLine:
 
     def prepared(self, options: CommandOptions) -> list[str]:
         """The same words for Hydra; InputError names the first one that cannot be meant."""
-        return [*self.flags, *(self._prepared(word, options) for word in self.overrides)]
+        words = [*self.flags, *(self._prepared(word, options) for word in self.overrides)]
+        is_of_any = any(f"task={task}" in self.overrides for task in schema.ANY_CATEGORY_TASKS)
+        has_category = any(word.startswith("category=") for word in self.overrides)
+        return [*words, "category=all"] if is_of_any and not has_category else words
 
     def _prepared(self, word: str, options: CommandOptions) -> str:
         parts = _WORD.fullmatch(word)

@@ -38,8 +38,15 @@ from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.diffusion.hub import is_repository, weights_folder
 from extrap_train.diffusion.lora import temporary_adapter
 from extrap_train.diffusion.model import ExtrapolationModel
-from extrap_train.diffusion.model_files import load_model
+from extrap_train.diffusion.model_files import (
+    is_own,
+    load_model,
+    published_config,
+    published_model,
+    saved_config,
+)
 from extrap_train.diffusion.packaged import packaged_name
+from extrap_train.diffusion.published.read import weights_at
 from extrap_train.errors import InputError
 from extrap_train.store.digests import model_files
 
@@ -58,8 +65,9 @@ class Diffusion:
     )
     weights: str | None = option(
         None,
-        "model folder, packaged model or repository, where `{category}` stands for the capture's; "
-        "null: FAMILY-{category} for ours, FAMILY for the category-agnostic others",
+        "model folder, published checkpoint, packaged model or repository, where `{category}` "
+        "stands for the capture's; null: FAMILY-{category} for ours, FAMILY for the "
+        "category-agnostic others",
     )
     references: int | None = option(
         None, "most inputs that a target is warped from; null: the model's number", low=1
@@ -83,26 +91,30 @@ class Diffusion:
         return sampler_for(chosen, model.config)
 
     def weight_files(self, category: str) -> Sequence[Path]:
-        """The files of the model's folder."""
-        return list(model_files(self._folder(category)))
+        """The files of the model's folder, or the published checkpoint.
+
+        Raises InputError for a model of another family.
+        """
+        place = self._place(category)
+        config = saved_config(place) if is_own(place) else published_config(str(place))
+        if config.family != self.family:
+            raise InputError(
+                f"{place}: is a model of the family {config.family}; give weights of {self.family}"
+            )
+        return list(model_files(place)) if place.is_dir() else [place]
 
     def synthesize(self, inputs: SceneInputs) -> Synthesis:
         """Generate every target.
 
         The time is a single image's share of all that the scene takes, compiling and loading aside.
         """
-        folder = self._folder(inputs.category)
-        model = _load_cached(folder)
-        if model.config.family != self.family:
-            raise InputError(
-                f"{folder}: is a model of the family {model.config.family}, not {self.family}; "
-                "give weights= of the right one"
-            )
+        place = self._place(inputs.category)
+        model = _load_cached(place)
         self._warm_up(model, inputs)
         with Stopwatch() as watch:
             made = self.sample(model, inputs)
         size = (inputs.targets.height, inputs.targets.width)
-        given = {"weights": folder.name, "depth": "used" if self.family != "zeronvs" else "scale"}
+        given = {"weights": place.name, "depth": "used" if self.family != "zeronvs" else "scale"}
         given |= photographs_used(inputs.fine_views)
         if made.images.shape[-2:] != size:
             given["made at"] = f"{made.images.shape[-1]} px"
@@ -137,12 +149,12 @@ class Diffusion:
         quick = replace(generator, sampler=replace(generator.sampler, steps=1, compat=None))
         quick.generate(views_with_depth(inputs), inputs.targets, target_names(inputs), inputs.seed)
 
-    def _folder(self, category: str) -> Path:
+    def _place(self, category: str) -> Path:
         name = (self.weights or packaged_name(self.family, category)).replace(
             "{category}", category
         )
-        if self.weights is not None and name not in packaged_names() and Path(name).is_dir():
-            return Path(name)
+        if self.weights is not None and name not in packaged_names() and Path(name).exists():
+            return weights_at(Path(name)) or Path(name)
         try:
             return weights_folder(name, "weights")
         except InputError as error:
@@ -151,7 +163,7 @@ class Diffusion:
             is_ours = self.family == "ours"
             recipe = f"category={category}" if is_ours else f"experiment=small_{self.family}"
             raise Unavailable(
-                f"no weights: {name} is neither a model folder nor in the package; train them with "
+                f"no weights: {name} is no file or folder nor in the package; train them with "
                 f"`python -m extrap_train {recipe}` and give the run's model/ folder as "
                 f"options.METHOD.weights=FOLDER"
             ) from None
@@ -163,9 +175,10 @@ def target_names(inputs: SceneInputs) -> list[str]:
 
 
 @lru_cache(2)
-def _load_cached(folder: Path) -> ExtrapolationModel:
+def _load_cached(place: Path) -> ExtrapolationModel:
     """A worker makes one cell after another, mostly with the same model."""
-    model = load_model(folder).eval().requires_grad_(False)
+    opened = load_model(place) if is_own(place) else published_model(str(place))
+    model = opened.eval().requires_grad_(False)
     return model.to("cuda") if torch.cuda.is_available() else model
 
 

@@ -60,7 +60,10 @@ def is_ours(config: MethodConfig) -> bool:
 
 def _describe(config: MethodConfig, categories: Sequence[str]) -> MethodContent:
     method = build_method(config)
-    weights = {category: _weights_digest(method, category) for category in categories}
+    try:
+        weights = {category: _weights_digest(method, category) for category in categories}
+    except InputError as error:
+        raise InputError(f"method {config.name}: {error}") from None
     return MethodContent(weights, making_code(type(method).__module__))
 
 

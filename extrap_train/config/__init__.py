@@ -13,6 +13,7 @@ from extrap_train.config.checks import (
     validate_model,
 )
 from extrap_train.config.commands import (
+    ANY_CATEGORY_TASKS,
     PAIR_TASKS,
     TASKS,
     DataPrepConfig,

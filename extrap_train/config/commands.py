@@ -152,6 +152,7 @@ TASKS = {
     "category": "prepare a category, train its model, and measure it on held-out sequences",
     "check": "draw what proves or disproves a scene's poses, scale, lens and masks",
     "complete": "complete a scene all around: point cloud, views, Gaussians, turntable",
+    "convert": "turn a published checkpoint (weights=FILE) into a model folder (to=FOLDER)",
     "depth": "train the network that gives the views of task=complete their depth",
     "pack": "write a trained model as a packaged one",
     "push": "upload a trained model to the Hugging Face hub (repo=org/name)",
@@ -162,6 +163,8 @@ TASKS = {
 """What each value of `task=` does."""
 PAIR_TASKS = ("category", "validate")
 """Tasks that prepare pairs of photographs."""
+ANY_CATEGORY_TASKS = ("convert",)
+"""Tasks that have nothing to do with a category, so that none has to be given."""
 
 
 @dataclass
@@ -185,6 +188,7 @@ class TrainConfig(SceneOptions):
         None,
         "name of the run's folder; null: made from the options, so that the same command resumes",
     )
+    to: str | None = option(None, "folder that task=convert writes")
     repo: str | None = option(None, "repository of the hub that task=push uploads to, as org/name")
     resume: bool = option(True, "continue or reuse what is there; false replaces it")
     output: str = option("outputs", "folder of all results")

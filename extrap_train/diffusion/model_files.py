@@ -17,13 +17,17 @@ from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.packaged import compress, packaged_weights, restore
 from extrap_train.diffusion.published.config_compat import SCHEDULER, require_same_config
 from extrap_train.diffusion.published.read import SOURCES, Shapes, read_published, weights_at
+from extrap_train.diffusion.published.recognise import (
+    input_channels,
+    published_family,
+    recognise_config,
+)
 from extrap_train.diffusion.transfer import narrowed, turned_pose, widened
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import atomic_folder
 from extrap_train.store.records import read_record, write_record
 from extrap_train.weight_files import WeightFile, write_tensors
 
-_PUBLISHED_CHANNELS = {8: "zeronvs", 11: "megascenes"}
 _COMPACT = "difference.safetensors"
 _REMEDY = "give a model/ folder that task=category wrote"
 _DIFFUSERS_NAME = "diffusion_pytorch_model.safetensors"
@@ -154,17 +158,14 @@ def load_weights(
     read = _read_compact if is_compact(path) else read_published
     found = read(path, wanted, model.config, option)
     file, unet = found["unet"]
-    first = unet.get("conv_in.weight")
-    if first is None or first.ndim != 4:
-        raise file.refusal("has no convolution conv_in that the denoiser begins with")
-    family = _family(path, file, first)
+    channels = input_channels(file, unet)
+    family = saved_config(path).family if is_own(path) else published_family(file, unet)
     if family != model.config.family:
         if not to_train:
-            raise file.refusal(_untrained(family, first, model.config))
+            raise file.refusal(_untrained(family, channels, model.config))
         _take_over(found, family, model)
     elif model.config.geometry and _lacks_geometry(path, model.config):
-        channels = model.unet.conv_in.weight.shape[1]
-        unet["conv_in.weight"] = widened(unet["conv_in.weight"], channels)
+        unet["conv_in.weight"] = widened(unet["conv_in.weight"], model.unet.conv_in.in_channels)
     for part, (part_file, tensors) in found.items():
         part_file.fill(networks[part], tensors)
 
@@ -185,17 +186,6 @@ def _require_same_start(path: Path, config: ModelConfig) -> None:
             )
 
 
-def _family(path: Path, file: WeightFile, conv_in: Tensor) -> str:
-    if is_own(path):
-        return saved_config(path).family
-    channels = conv_in.shape[1]
-    if channels not in _PUBLISHED_CHANNELS:
-        raise file.refusal(
-            f"its denoiser takes {channels} channels, where ZeroNVS's takes 8 and MegaScenes's 11"
-        )
-    return _PUBLISHED_CHANNELS[channels]
-
-
 def _lacks_geometry(path: Path, config: ModelConfig) -> bool:
     """Whether all that a saved model's denoiser is not told is the warp's depth and confidence;
     published ones never were.
@@ -204,9 +194,9 @@ def _lacks_geometry(path: Path, config: ModelConfig) -> bool:
     return saved is not None and not saved.geometry and saved.octaves == config.octaves
 
 
-def _untrained(family: str, conv_in: Tensor, config: ModelConfig) -> str:
+def _untrained(family: str, channels: int, config: ModelConfig) -> str:
     said = (
-        f"is of the family {family} ({conv_in.shape[1]} input channels), but model={config.name} "
+        f"is of the family {family} ({channels} input channels), but model={config.name} "
         f"is of {config.family} and was never trained: give model={family}"
     )
     is_a_start = family == "zeronvs"  # of a VAE's latents, none is narrowed
@@ -251,19 +241,30 @@ def initial_model(config: ModelConfig) -> ExtrapolationModel:
     return _fill(config.start, config, "model.start", to_train=True)
 
 
-def published_model(weights: str, config: ModelConfig) -> ExtrapolationModel:
-    """The model that `config` describes as a published checkpoint has it, to be used as it is.
+def published_model(weights: str, config: ModelConfig | None = None) -> ExtrapolationModel:
+    """A published checkpoint's model, to be used as it is: the one that `config` describes, by
+    default the one that its tensors show.
 
     Raises InputError for weights of another family: they are a start, and no model.
     """
+    config = published_config(weights) if config is None else config
     return _fill(weights, config, "weights", to_train=False)
+
+
+def published_config(weights: str, option: str = "weights") -> ModelConfig:
+    """What the published checkpoint that `option` named is, by its tensors."""
+    return recognise_config(_place(weights, option), option)
 
 
 def _fill(weights: str, config: ModelConfig, option: str, *, to_train: bool) -> ExtrapolationModel:
     with torch.device("meta"):
         model = ExtrapolationModel(config)
+    load_weights(model, _place(weights, option), option, to_train=to_train)
+    return model
+
+
+def _place(weights: str, option: str) -> Path:
+    """The file or folder that holds the weights of this name."""
     given = packaged_weights(weights) if weights in packaged_names() else Path(weights)
     path = given if is_compact(given) else weights_at(given)
-    found = weights_folder(weights, option) if path is None else path
-    load_weights(model, found, option, to_train=to_train)
-    return model
+    return weights_folder(weights, option) if path is None else path

@@ -21,6 +21,8 @@ from extrap_train.terminal import terminal
 MANIFEST = "manifest.json"
 """The manifest's file in the folder of every result."""
 
+PUBLISHED = "published"
+"""The source of captures that nobody here can name: those of weights that others have trained."""
 _PACKAGES = ("torch", "lightning", "diffusers", "numba", "numpy")
 _MOST_NAMED = 6
 
@@ -30,7 +32,9 @@ class Split:
     """The captures of one category that a model is trained on, and those held out for testing."""
 
     source: str
-    """`synthetic` or `co3d`: captures of different sources are different, whatever their names."""
+    """`synthetic`, `co3d` or `PUBLISHED`: captures of different sources are different, whatever
+    their names.
+    """
     train: tuple[str, ...]
     test: tuple[str, ...]
     seed: int | None = None

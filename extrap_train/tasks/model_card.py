@@ -18,13 +18,14 @@ from extrap_train.diffusion.leakage import (
 )
 from extrap_train.diffusion.model_files import is_own, saved_config
 from extrap_train.runs import RunFolder
-from extrap_train.store.manifest import MANIFEST, read_manifest
+from extrap_train.store.manifest import MANIFEST, PUBLISHED, read_manifest
 
 _OURS = "Apache-2.0"
 _TAGS = ["extrap-train", "novel-view-synthesis", "diffusion"]
 _OF_DATA = {
     "synthetic": "captures rendered by extrap-train",
     "co3d": "captures of CO3D (CC BY-NC 4.0)",
+    PUBLISHED: "captures that the authors of published weights chose",
 }
 
 
@@ -85,7 +86,7 @@ def _captures(trainings: Sequence[TrainedCaptures]) -> str:
     """How many there are, and where they come from."""
     seen = {(t.split.source, t.split.seed, t.category, n) for t in trainings for n in t.split.train}
     sources = sorted({_OF_DATA.get(t.split.source, t.split.source) for t in trainings})
-    return f"{len(seen)} {' and '.join(sources)}"
+    return f"{len(seen) or 'unknown'} {' and '.join(sources)}"
 
 
 def _start(start: str | None) -> tuple[str, str]:

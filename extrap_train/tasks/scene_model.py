@@ -154,20 +154,16 @@ def open_model(
     """The model of a folder, the package, a repository or a published checkpoint, with a scene's
     adapter applied if any.
 
-    A published checkpoint does not say what it is: it is read as the model that `config` describes.
+    A published checkpoint is read as the model that `config` describes, by default as the one that
+    its tensors show.
     """
     path = _folder_of(weights)
     if is_own(path):
         if config is not None:
             raise InputError(f"weights={weights}: says itself what it is; leave config out")
         model = load_model(path)
-    elif config is not None:
-        model = published_model(weights, config)
     else:
-        raise InputError(
-            f"weights={weights}: is not a model folder of this project; a published checkpoint "
-            "needs the configuration of its model as well"
-        )
+        model = published_model(weights, config)
     if adapter is not None:
         load_adapter(model, Path(adapter))
     return use_channels_last(model).eval()

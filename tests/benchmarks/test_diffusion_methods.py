@@ -101,13 +101,20 @@ def _with_other_photograph(inputs: SceneInputs, index: int) -> SceneInputs:
     return replace(inputs, views=changed(inputs.views), fine_views=changed(inputs.fine_views))
 
 
-def test_its_weight_files_are_also_those_that_a_link_leads_to(tmp_path: Path) -> None:
-    (tmp_path / "unet").mkdir()
-    (tmp_path / "unet" / "weights.safetensors").touch()
-    (tmp_path / "model").mkdir()
-    (tmp_path / "model" / "unet").symlink_to(tmp_path / "unet")
-    files = Diffusion(weights=str(tmp_path / "model")).weight_files("analytic")
-    assert files == [tmp_path / "model" / "unet" / "weights.safetensors"]
+def test_its_weight_files_are_also_those_that_a_link_leads_to(weights: str, tmp_path: Path) -> None:
+    for part in Path(weights).iterdir():
+        (tmp_path / part.name).symlink_to(part)
+    files = Diffusion(weights=str(tmp_path)).weight_files("analytic")
+    assert tmp_path / "unet" / "diffusion_pytorch_model.safetensors" in files
+
+
+@each_variant
+def test_weights_of_another_family_are_refused_before_anything_runs(
+    name: str, weights: str
+) -> None:
+    method = replace(VARIANTS[name], family="zeronvs", weights=weights, references=None)
+    with pytest.raises(InputError, match="is a model of the family ours; give weights of zeronvs"):
+        method.weight_files("analytic")
 
 
 @pytest.mark.usefixtures("cheap")

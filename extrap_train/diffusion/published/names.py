@@ -44,16 +44,25 @@ def renamed(
     prefix = PREFIXES[part]
     own = {name: x for name, x in state.items() if name.startswith(prefix)}
     if part == "unet":
-        layers = {"layers_per_block": config.unet.layers_per_block}
-        return dict(convert_ldm_unet_checkpoint(own, layers))
+        return renamed_unet(own, config.unet.layers_per_block)
     if part == "vae":
         assert config.vae is not None
-        levels = dict.fromkeys(("down_block_types", "up_block_types"), config.vae.channels)
-        return dict(convert_ldm_vae_checkpoint(own, levels))
+        return renamed_vae(own, len(config.vae.channels))
     if part == "image_encoder":
         places = {name: clip_origin(name) for name in wanted}
         return {name: make(own[place]) for name, (place, make) in places.items() if place in own}
     return {name.removeprefix(prefix): x for name, x in own.items()}
+
+
+def renamed_unet(state: dict[str, Tensor], layers_per_block: int) -> dict[str, Tensor]:
+    """The denoiser's tensors by diffusers' names."""
+    return dict(convert_ldm_unet_checkpoint(state, {"layers_per_block": layers_per_block}))
+
+
+def renamed_vae(state: dict[str, Tensor], levels: int) -> dict[str, Tensor]:
+    """The autoencoder's tensors by diffusers' names."""
+    blocks = dict.fromkeys(("down_block_types", "up_block_types"), range(levels))
+    return dict(convert_ldm_vae_checkpoint(state, blocks))
 
 
 def clip_origin(name: str) -> tuple[str, Callable[[Tensor], Tensor]]:

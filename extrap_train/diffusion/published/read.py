@@ -56,10 +56,18 @@ def read_published(
         return {
             part: _folder_part(path / part, part, shapes, option) for part, shapes in wanted.items()
         }
-    file = WeightFile(path, option, SOURCES)
-    state = file.tensors(file.read(_LIGHTNING_REMARKS), "state_dict")
+    file, state = latent_diffusion_state(path, option)
     parts = _from_latent_diffusion(file, state, wanted, config)
     return {part: (file, tensors) for part, tensors in parts.items()}
+
+
+def latent_diffusion_state(path: Path, option: str) -> tuple[WeightFile, dict[str, Tensor]]:
+    """The tensors of a published file under its own names."""
+    file = WeightFile(path, option, SOURCES)
+    state = file.tensors(file.read(_LIGHTNING_REMARKS), "state_dict")
+    if all(name.startswith("module.") for name in state):  # saved from inside DDP
+        state = {name.removeprefix("module."): x for name, x in state.items()}
+    return file, state
 
 
 def weights_at(path: Path) -> Path | None:
@@ -76,22 +84,26 @@ def weights_at(path: Path) -> Path | None:
 def _folder_part(
     folder: Path, part: str, shapes: Shapes, option: str
 ) -> tuple[WeightFile, dict[str, Tensor]]:
-    candidates = [folder / (n + s) for s in _SUFFIXES for n in _FOLDER_FILES[part]]
-    found = next((path for path in candidates if path.is_file()), candidates[0])
-    file = WeightFile(found, option, SOURCES)
-    state = file.tensors(file.read())
-    state.pop("vision_model.embeddings.position_ids", None)  # saved by older transformers
+    file, state = folder_state(folder, part, option)
     missing = [name for name in shapes if name not in state]
     if missing:
         raise file.refusal(_listed(missing, len(shapes), "is the folder of another network?"))
     return file, state
 
 
+def folder_state(folder: Path, part: str, option: str) -> tuple[WeightFile, dict[str, Tensor]]:
+    """The tensors of one network's folder, as diffusers or transformers writes it."""
+    candidates = [folder / (n + s) for s in _SUFFIXES for n in _FOLDER_FILES[part]]
+    found = next((path for path in candidates if path.is_file()), candidates[0])
+    file = WeightFile(found, option, SOURCES)
+    state = file.tensors(file.read())
+    state.pop("vision_model.embeddings.position_ids", None)  # saved by older transformers
+    return file, state
+
+
 def _from_latent_diffusion(
     file: WeightFile, state: dict[str, Tensor], wanted: Mapping[str, Shapes], config: ModelConfig
 ) -> dict[str, dict[str, Tensor]]:
-    if all(name.startswith("module.") for name in state):  # saved from inside DDP
-        state = {name.removeprefix("module."): x for name, x in state.items()}
     for part, names in wanted.items():
         expected = {clip_origin(name)[0] for name in names} if part == "image_encoder" else names
         surplus = sum(name.startswith(PREFIXES[part]) for name in state) - len(expected)
@@ -103,7 +115,7 @@ def _from_latent_diffusion(
     try:
         parts = {part: renamed(part, state, names, config) for part, names in wanted.items()}
     except DAMAGE:  # of names that no such network has
-        raise file.refusal(_cause(state)) from None
+        raise file.refusal(likely_cause(state)) from None
     found = {
         part: {name: parts[part][name] for name in names if name in parts[part]}
         for part, names in wanted.items()
@@ -111,12 +123,17 @@ def _from_latent_diffusion(
     missing = [f"{part}.{n}" for part in wanted for n in wanted[part] if n not in found[part]]
     if missing:
         total = sum(map(len, wanted.values()))
-        raise file.refusal(_listed(missing, total, _cause(state)))
+        raise file.refusal(_listed(missing, total, likely_cause(state)))
     return found
 
 
-def _cause(state: Mapping[str, Tensor]) -> str:
-    """Why the tensors are probably missing."""
+_ANOTHER_SIZE = (
+    "it is of another size than model.unet, model.vae and model.clip say, or was cut down"
+)
+
+
+def likely_cause(state: Mapping[str, Tensor], otherwise: str = _ANOTHER_SIZE) -> str:
+    """Why tensors are probably missing; `otherwise` where whole networks are there."""
     if any(name.startswith("cond_stage_model.transformer.") for name in state):
         return "it is a text-to-image Stable Diffusion, not a model of this family"
     gone = [
@@ -128,7 +145,7 @@ def _cause(state: Mapping[str, Tensor]) -> str:
         return "its names are not those of a latent-diffusion checkpoint"
     if gone:
         return f"it was exported without {' and '.join(gone)}"
-    return "it is of another size than model.unet, model.vae and model.clip say, or was cut down"
+    return otherwise
 
 
 def _listed(missing: Sequence[str], total: int, cause: str) -> str:

@@ -9,6 +9,7 @@ from published_networks import configured
 
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.model_files import load_weights
+from extrap_train.diffusion.published.recognise import recognise_config
 from extrap_train.weight_files import WeightFile
 
 
@@ -54,3 +55,14 @@ def test_the_published_layout_loads(
     assert counted["unet"] == denoiser_parameters
     assert counted["vae"] == 83_653_863
     assert counted["cc_projection"] == 605_184
+
+
+@pytest.mark.parametrize("family", ["zeronvs", "megascenes"])
+def test_the_published_layout_is_recognised(
+    shared: Path, monkeypatch: pytest.MonkeyPatch, family: str
+) -> None:
+    """As the model that `model=FAMILY` describes, whose numbers stand in its file."""
+    shapes = _layout(shared / "layouts", family)
+    state = {name: torch.empty(shape) for name, shape in shapes.items()}
+    monkeypatch.setattr(WeightFile, "read", lambda *_: state)
+    assert recognise_config(Path("weights.ckpt"), "weights") == configured(family)

@@ -64,15 +64,6 @@ def test_it_is_adapted(command, references: dict[str, Reference], tmp_path: Path
     assert load_file(folder / "adapter" / "adapter_model.safetensors")
 
 
-def test_without_its_configuration_it_is_refused(
-    references: dict[str, Reference], tmp_path: Path
-) -> None:
-    path = tmp_path / "zeronvs.ckpt"
-    torch.save({"state_dict": references["zeronvs"].state}, path)
-    with pytest.raises(InputError, match="needs the configuration of its model"):
-        open_generator(str(path))
-
-
 def test_of_another_size_than_the_model_it_says_which_option(
     command, references: dict[str, Reference], tmp_path: Path
 ) -> None:
