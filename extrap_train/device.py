@@ -68,6 +68,23 @@ def autocast(device: torch.device, precision: str) -> AbstractContextManager[obj
     return torch.autocast(device.type, torch.float16 if is_half else torch.bfloat16)
 
 
+@contextmanager
+def single_precision(device: torch.device) -> Iterator[None]:
+    """Let networks compute in single precision; on a GPU their products may round to TF32.
+
+    The geometry's products never may, so that it is no setting of the whole process: a pose far
+    from the world's origin would lose its translation.
+    """
+    before = torch.get_float32_matmul_precision()
+    if device.type == "cuda":
+        torch.set_float32_matmul_precision("high")
+    try:
+        with torch.autocast(device.type, enabled=False):
+            yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
 def is_out_of_memory(error: BaseException) -> bool:
     """Whether an error says that a GPU's memory or the machine's is used up."""
     if isinstance(error, torch.OutOfMemoryError | MemoryError):

@@ -50,6 +50,7 @@ _NOT_PART_OF_THE_RUN = (
     "trainer.gradient_checkpointing",
     "trainer.deterministic",
     "trainer.compile",
+    "trainer.latents",
     "trainer.accelerator",
     "trainer.workers",
     "trainer.checkpoint_every",

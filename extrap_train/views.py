@@ -212,10 +212,26 @@ class Warp:
 
 
 @dataclass(frozen=True)
+class FrameFeatures:
+    """What frozen networks say of a batch's photographs, computed once per frame beforehand.
+
+    The first dimensions are those of a batch, or of both orientations of one example.
+    """
+
+    target_mean: Float[Tensor, "*b z p q"]
+    """Mean of the target's posterior in the autoencoder's latent space, not scaled."""
+    target_std: Float[Tensor, "*b z p q"]
+    reference_mean: Float[Tensor, "*b z p q"]
+    """The same of the nearest reference."""
+    reference_embedding: Float[Tensor, "*b d"]
+
+
+@dataclass(frozen=True)
 class PairBatch:
     """Examples: target view, up to `k` references (nearest first), and the warp between them."""
 
     image: Float[Tensor, "b 3 h w"]
+    """NaN where the target is not known, or only its `features` are."""
     camera: Camera
     reference_images: Float[Tensor, "b k 3 h w"]
     reference_cameras: Camera
@@ -227,6 +243,8 @@ class PairBatch:
     they are."""
     object_mask: Bool[Tensor, "b h w"] | None = None
     """Where the target view shows the object; None where that is not known."""
+    features: FrameFeatures | None = None
+    """None where the frozen networks are to be asked."""
     warp: Warp | None = None
     """Made by `geometry.warp.compute_warp` once the batch is on its device; None until then."""
 
@@ -239,7 +257,8 @@ class PairBatch:
 class PackedBatch:
     """A `PairBatch` on its way to a device, as frames are stored: a third of its bytes."""
 
-    image: UInt8[Tensor, "b 3 h w"]
+    image: UInt8[Tensor, "b 3 h w"] | None
+    """None where `features` stand for it."""
     camera: Camera
     reference_images: UInt8[Tensor, "b k 3 h w"]
     reference_cameras: Camera
@@ -248,6 +267,7 @@ class PackedBatch:
     reference_valid: Bool[Tensor, "b k"]
     reference_flows: Float[Tensor, "b k 2 g g"] | None = None
     object_mask: Bool[Tensor, "b h w"] | None = None
+    features: FrameFeatures | None = None
 
     def to(self, device: torch.device | str) -> "PackedBatch":
         """The same batch on another device, which pinned memory reaches while others compute."""
@@ -259,15 +279,18 @@ class PackedBatch:
 
     def unpack(self) -> PairBatch:
         """Colours in [0, 1] and depth in scene units, in single precision."""
+        references = _colours(self.reference_images)
+        unknown = torch.full_like(references[:, 0], torch.nan)
         return PairBatch(
-            image=_colours(self.image),
+            image=unknown if self.image is None else _colours(self.image),
             camera=self.camera,
-            reference_images=_colours(self.reference_images),
+            reference_images=references,
             reference_cameras=self.reference_cameras,
             reference_depths=self.reference_depths.float() * self.depth_unit[:, None, None, None],
             reference_valid=self.reference_valid,
             reference_flows=self.reference_flows,
             object_mask=self.object_mask,
+            features=combine([self.features], lambda tensors: tensors[0].float()),
         )
 
 

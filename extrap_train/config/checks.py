@@ -32,6 +32,8 @@ def validate(config: TrainConfig | DataPrepConfig) -> None:
         # Before anything is written: a wrong root must not leave a run behind.
         raise InputError(f"data.root={root}: no such folder; give the folder of the download")
     _check_files(config)
+    if isinstance(config, DataPrepConfig) and config.model is not None:
+        _check_encoder(config.model, config.prep)
     if isinstance(config, TrainConfig):
         _check_intervals(config.trainer)
         _check_model(config.model)
@@ -121,6 +123,17 @@ def _check_pairs(model: ModelConfig, prep: PrepConfig) -> None:
             f"{model.warp_scale} times model.image_size={model.image_size}: give "
             f"prep.image_size={model.warp_size}"
         )
+
+
+def _check_encoder(model: ModelConfig, prep: PrepConfig) -> None:
+    """`data_prep` takes a model for its frozen networks alone."""
+    if model.vae is None or model.clip is None:
+        raise InputError(
+            f"model={model.name} has no frozen networks that could encode frames beforehand; "
+            "leave it out"
+        )
+    _check_model(model)
+    _check_pairs(model, prep)
 
 
 def validate_model(model: ModelConfig) -> None:

@@ -53,6 +53,12 @@ class TrainerConfig:
     gradient_checkpointing: bool = option(
         False, "compute the denoiser's activations twice: less memory, more time"
     )
+    latents: str = option(
+        "computed",
+        "frozen networks' part of a step: computed, cached by data_prep with model=, or auto: "
+        "cached if it is there",
+        known=("computed", "cached", "auto"),
+    )
     compile: bool = option(
         False, "compile the denoiser: minutes at the start, faster steps on a GPU"
     )
@@ -204,6 +210,8 @@ class DataPrepConfig:
     depth: DepthConfig = MISSING
     matcher: MatcherConfig = MISSING
     launcher: LauncherConfig = MISSING
+    model: ModelConfig | None = None
+    """Whose frozen networks encode every training frame once, for trainer.latents=cached."""
     prep: PrepConfig = field(default_factory=PrepConfig)
     output: str = option("outputs", "folder of all results")
     workers: int | None = option(

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from extrap_train.data.camera_check import is_degenerate
+from extrap_train.data.feature_files import FeatureFiles, FrameEncoder
 from extrap_train.data.prepared import PreparedData
 from extrap_train.depth import require_depth
 from extrap_train.errors import InputError
@@ -22,8 +23,18 @@ from extrap_train.geometry.viewpoints import (
     references_by_nearness,
     scene_center,
 )
-from extrap_train.views import Camera, PackedBatch, PairBatch, View, ViewPair, stack_cameras
+from extrap_train.views import (
+    Camera,
+    FrameFeatures,
+    PackedBatch,
+    PairBatch,
+    View,
+    ViewPair,
+    combine,
+    stack_cameras,
+)
 
+Part = TypeVar("Part")
 _DEGENERATE = (
     "its camera is degenerate (NaN, no rotation, or a focal length that is not positive); correct "
     "the pose"
@@ -37,7 +48,8 @@ class Example:
     Colours are in [0, 1], or bytes, as frames are stored, and depth then in units of `depth_unit`.
     """
 
-    image: Shaped[Tensor, "3 h w"]
+    image: Shaped[Tensor, "3 h w"] | None
+    """None where `features` stand for it."""
     camera: Camera
     reference_images: Shaped[Tensor, "k 3 h w"]
     reference_cameras: Camera
@@ -46,6 +58,8 @@ class Example:
     depth_unit: float = 1.0
     object_mask: Bool[Tensor, "h w"] | None = None
     """Where the query shows the object; known in held-out examples only."""
+    features: FrameFeatures | None = None
+    """Of both orientations: as the example is, and in a mirror."""
 
 
 def mirror(example: Example) -> Example:
@@ -53,13 +67,14 @@ def mirror(example: Example) -> Example:
     flows, flip = example.reference_flows, torch.tensor([-1.0, 1.0])[:, None, None]
     return replace(
         example,
-        image=example.image.flip(-1),
+        image=None if example.image is None else example.image.flip(-1),
         camera=_mirror_camera(example.camera),
         reference_images=example.reference_images.flip(-1),
         reference_cameras=_mirror_camera(example.reference_cameras),
         reference_depths=example.reference_depths.flip(-1),
         reference_flows=None if flows is None else flows.flip(-1) * flip,
         object_mask=None if example.object_mask is None else example.object_mask.flip(-1),
+        features=combine([example.features], lambda both: both[0].flip(0)),
     )
 
 
@@ -90,9 +105,8 @@ def _stack(examples: Sequence[Example], references: int) -> dict[str, Any]:
     ]
     valid = [[i < len(e.reference_images) for i in range(references)] for e in examples]
     pairs = list(zip(examples, orders, strict=True))
-    masks = [e.object_mask for e in examples if e.object_mask is not None]
     return {
-        "image": torch.stack([e.image for e in examples]),
+        "image": _stack_known([e.image for e in examples]),
         "camera": stack_cameras([e.camera for e in examples]),
         "reference_images": _gather([e.reference_images for e in examples], orders),
         "reference_cameras": stack_cameras(
@@ -101,8 +115,19 @@ def _stack(examples: Sequence[Example], references: int) -> dict[str, Any]:
         "reference_depths": _gather([e.reference_depths for e in examples], orders),
         "reference_valid": torch.tensor(valid),
         "reference_flows": _flows([(e.reference_flows, o) for e, o in pairs]),
-        "object_mask": torch.stack(masks) if len(masks) == len(examples) else None,
+        "object_mask": _stack_known([e.object_mask for e in examples]),
+        "features": _stack_known(
+            [combine([e.features], lambda both: both[0][0]) for e in examples]
+        ),
     }
+
+
+def _stack_known(values: Sequence[Part | None]) -> Part | None:
+    """The examples' values as one; None where one of them has none."""
+    known = [value for value in values if value is not None]
+    if len(known) < len(values):
+        return None
+    return combine(known, lambda tensors: torch.stack(list(tensors)))
 
 
 def _gather(
@@ -157,19 +182,27 @@ def query_batch(
     return collate(examples, most_references), [tuple(row) for row in order.tolist()]
 
 
-def read_example(data: PreparedData, pair: ViewPair, is_corrected: bool) -> Example:
-    """The pair's example, as stored, with all its references, and their flows if `is_corrected`."""
-    sequence, frames = pair.sequence, [pair.query, *pair.references]
-    images = data.images(sequence, frames)
-    cameras = data.cameras(sequence)[torch.tensor(frames)]
+def read_example(
+    data: PreparedData,
+    pair: ViewPair,
+    is_corrected: bool,
+    cached: FeatureFiles | None = None,
+) -> Example:
+    """The pair's example, as stored, with all its references, and their flows if `is_corrected`.
+
+    With `cached` features, which stand for it, the query's photograph is not read.
+    """
+    sequence, query, references = pair.sequence, pair.query, list(pair.references)
+    cameras = data.cameras(sequence)
     return Example(
-        images[0],
-        cameras[0],
-        images[1:],
-        cameras[1:],
-        data.depths(sequence, pair.references),
-        data.flows(sequence, pair.references, pair.query) if is_corrected else None,
+        None if cached else data.images(sequence, [query])[0],
+        cameras[query],
+        data.images(sequence, references),
+        cameras[torch.tensor(references)],
+        data.depths(sequence, references),
+        data.flows(sequence, references, query) if is_corrected else None,
         data.depth_unit(sequence),
+        features=cached.read(sequence, query, references[0]) if cached else None,
     )
 
 
@@ -182,9 +215,18 @@ def linspace_indices(available: int, wanted: int) -> list[int]:
 class ExampleReader:
     """Examples of one split of one or several prepared categories."""
 
-    def __init__(self, prepared: list[PreparedData], split: str, references: int) -> None:
+    def __init__(
+        self,
+        prepared: list[PreparedData],
+        split: str,
+        references: int,
+        encoder: FrameEncoder | None = None,
+    ) -> None:
+        """With an `encoder`, examples have its cached features instead of their target."""
         self.references = references
+        self._arguments = (prepared, split, references, encoder)
         self._prepared, self._split = prepared, split
+        self._cached = [FeatureFiles(data, encoder) if encoder else None for data in prepared]
         self._pairs = [data.pairs(split) for data in prepared]
         self._ends = [*accumulate(len(pairs) for pairs in self._pairs)]
         self._angles: dict[tuple[Path, str], np.ndarray] = {}
@@ -192,12 +234,15 @@ class ExampleReader:
     def __len__(self) -> int:
         return self._ends[-1]
 
-    def __reduce__(self) -> tuple[type["ExampleReader"], tuple[list[PreparedData], str, int]]:
+    def __reduce__(self) -> tuple[type["ExampleReader"], tuple[Any, ...]]:
         """Another process opens the data itself, instead of being sent a million pairs."""
-        return ExampleReader, (self._prepared, self._split, self.references)
+        return ExampleReader, self._arguments
+
+    def _member(self, index: int) -> int:
+        return bisect_right(self._ends, index)
 
     def _pair(self, index: int) -> tuple[PreparedData, ViewPair]:
-        member = bisect_right(self._ends, index)
+        member = self._member(index)
         first = self._ends[member - 1] if member else 0
         return self._prepared[member], self._pairs[member][index - first]
 
@@ -223,7 +268,8 @@ class ExampleReader:
         )
         first, angles = pair.references[0], self._angles_of(data, pair.sequence)
         further = extra_references(angles, pair.query, first, count, rng, candidates)
-        example = read_example(data, replace(pair, references=(first, *further)), is_corrected)
+        pair = replace(pair, references=(first, *further))
+        example = read_example(data, pair, is_corrected, self._cached[self._member(index)])
         if self._split == "train":
             return example
         return replace(example, object_mask=data.mask(pair.sequence, pair.query))

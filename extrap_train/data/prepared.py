@@ -36,6 +36,7 @@ from extrap_train.data.frame_files import (
     map_array,
     matrices_of,
     pairs_folder,
+    sequence_folder,
     table_digest,
 )
 from extrap_train.errors import InputError
@@ -199,6 +200,16 @@ class PreparedData:
     def mask(self, sequence: str, index: int) -> Bool[Tensor, "h w"]:
         """Where a frame shows the object; everywhere where the capture has no mask."""
         return self._archive(sequence).mask(index)
+
+    def image_checksums(self, sequence: str) -> list[int]:
+        """CRC-32 of every frame's photograph as it is stored."""
+        rows = self._rows[sequence]
+        return self._frames["image_crc32"].slice(rows.start, rows.stop - rows.start).to_pylist()
+
+    def beside_frames(self, kind: str, sequence: str) -> Path:
+        """Where files of another kind about a sequence's frames lie, for all who share these."""
+        is_lone = self.roles[sequence] == "train and test"
+        return sequence_folder(self._frames_root, f"lone_{kind}" if is_lone else kind, sequence)
 
     def depth_unit(self, sequence: str) -> float:
         """A sequence's unit of depth in scene units, a power of two."""

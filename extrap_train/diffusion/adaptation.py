@@ -169,7 +169,7 @@ class _HeldOut:
         batch = compute_warp(batch.to(self.fabric.device), self.model.config.image_size)
         with self.fabric.autocast():
             conditioning = self.model.condition(batch)
-            target = self.model.encode_target(batch.image, conditioning)
+            target = self.model.encode_target(batch, conditioning)
         return target, conditioning, _anchor(batch, self.unchanged)
 
     def fit_into(self, seconds: float, clock: Callable[[], float]) -> None:

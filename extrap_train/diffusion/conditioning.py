@@ -90,12 +90,19 @@ def warp_of(batch: PairBatch) -> Warp:
     return batch.warp
 
 
+def reference_latent(batch: PairBatch, autoencoder: Autoencoder) -> Float[Tensor, "b z h w"]:
+    """The nearest reference's latent, as its channels expect it; computed unless it is cached."""
+    if batch.features is not None:
+        return batch.features.reference_mean
+    return autoencoder.encode_reference(batch.reference_images[:, 0])
+
+
 def concatenated_latents(
     batch: PairBatch, autoencoder: Autoencoder, octaves: int
 ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b z h w"]]:
     """The channels behind the noisy latent, and the filled warp's latent among them."""
     warp = warp_of(batch)
-    reference = autoencoder.encode_reference(batch.reference_images[:, 0])
+    reference = reference_latent(batch, autoencoder)
     warped = autoencoder.encode(filled_warp(warp))
     height, width = reference.shape[-2:]
     grid = send(coordinate_grid(height, width), reference)

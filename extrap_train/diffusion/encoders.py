@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 from diffusers import AutoencoderKL
-from diffusers.models.autoencoders.vae import DiagonalGaussianDistribution
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
@@ -106,25 +105,36 @@ class KlAutoencoder(Frozen):
         self, image: Float[Tensor, "b 3 h w"], generator: torch.Generator | None = None
     ) -> Float[Tensor, "b c h2 w2"]:
         """See `PixelPatches.encode`."""
-        posterior = self._posterior(image)
-        latent = posterior.mean.float()
-        if generator is not None:
-            noise = send(torch.randn(latent.shape, generator=generator), latent)
-            latent = latent + posterior.std.float() * noise
-        return latent * LATENT_SCALE
+        return draw_latent(*self.posterior(image), generator)
 
     def encode_reference(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c h2 w2"]:
         """See `PixelPatches.encode_reference`: the posterior's mode, not scaled, as in zero123."""
-        return self._posterior(image).mean.float()
+        return self.posterior(image)[0]
 
     @torch.no_grad()
-    def _posterior(self, image: Float[Tensor, "b 3 h w"]) -> DiagonalGaussianDistribution:
-        return self.network.encode(self._at(image * 2 - 1)).latent_dist
+    def posterior(
+        self, image: Float[Tensor, "b 3 h w"]
+    ) -> tuple[Float[Tensor, "b c h2 w2"], Float[Tensor, "b c h2 w2"]]:
+        """Mean and spread of the latents of images in [0, 1], not scaled."""
+        found = self.network.encode(self._at(image * 2 - 1)).latent_dist
+        return found.mean.float(), found.std.float()
 
     def decode(self, latent: Float[Tensor, "b c h2 w2"]) -> Float[Tensor, "b 3 h w"]:
         """See `PixelPatches.decode`."""
         image = self.network.decode(self._at(latent / LATENT_SCALE)).sample
         return image.float() / 2 + 0.5
+
+
+def draw_latent(
+    mean: Float[Tensor, "b c h w"],
+    std: Float[Tensor, "b c h w"],
+    generator: torch.Generator | None,
+) -> Float[Tensor, "b c h w"]:
+    """Scaled latents drawn from a posterior with a (CPU) generator; without, its mode."""
+    if generator is not None:
+        noise = send(torch.randn(mean.shape, generator=generator), mean)
+        mean = mean + std * noise
+    return mean * LATENT_SCALE
 
 
 Autoencoder = PixelPatches | KlAutoencoder

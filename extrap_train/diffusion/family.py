@@ -22,6 +22,7 @@ from extrap_train.diffusion.conditioning import (
     condition_channels,
     filled_warp,
     geometry_channels,
+    reference_latent,
     warp_of,
 )
 from extrap_train.diffusion.encoders import Autoencoder
@@ -45,7 +46,7 @@ class Family:
         self, batch: PairBatch, autoencoder: Autoencoder, config: ModelConfig
     ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b z h w"]]:
         """These channels, and the latent that the denoised one is relative to."""
-        reference = autoencoder.encode_reference(batch.reference_images[:, 0])
+        reference = reference_latent(batch, autoencoder)
         return reference, torch.zeros_like(reference)
 
     def pose(self, batch: PairBatch) -> Float[Tensor, "b 19"]:

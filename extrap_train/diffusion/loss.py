@@ -42,7 +42,7 @@ def diffusion_loss(
     alone; on its way to a GPU none waits for it. `min_snr` weighs the levels, see `snr_weights`.
     """
     conditioning = model.condition(batch)
-    target = model.encode_target(batch.image, conditioning, generator)
+    target = model.encode_target(batch, conditioning, generator)
     dropped = torch.rand(len(target), generator=generator) < condition_dropout
     steps = model.schedule.config["num_train_timesteps"]
     timestep = torch.randint(0, steps, (len(target),), generator=generator)

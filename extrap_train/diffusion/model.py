@@ -16,6 +16,7 @@ from extrap_train.diffusion.encoders import (
     KlAutoencoder,
     build_autoencoder,
     build_image_encoder,
+    draw_latent,
 )
 from extrap_train.diffusion.family import FAMILIES
 from extrap_train.diffusion.pose_encoding import POSE_CHANNELS
@@ -71,7 +72,12 @@ class ExtrapolationModel(nn.Module):
                 f"trained on {self.config.image_size} x {self.config.image_size}: resize them"
             )
         latents, base = self.family.latents(batch, self.autoencoder, self.config)
-        image = self.image_encoder(batch.reference_images[:, 0])
+        cached = batch.features
+        image = (
+            cached.reference_embedding
+            if cached is not None
+            else self.image_encoder(batch.reference_images[:, 0])
+        )
         embedding = torch.cat([image, self.family.pose(batch)], -1)
         whole = torch.ones_like(embedding[:, 0])
         return Conditioning(latents, embedding, base, whole, self.null)
@@ -90,15 +96,19 @@ class ExtrapolationModel(nn.Module):
 
     def encode_target(
         self,
-        image: Float[Tensor, "b 3 h w"],
+        batch: PairBatch,
         conditioning: Conditioning,
         generator: torch.Generator | None = None,
     ) -> Float[Tensor, "b z h2 w2"]:
-        """What is denoised: the image's latent, relative to the condition's base.
+        """What is denoised: the target's latent, relative to the condition's base.
 
         With a generator the latent is drawn from the autoencoder's posterior, where it has one.
         """
-        return self.autoencoder.encode(image, generator) - conditioning.base
+        if (cached := batch.features) is not None:
+            latent = draw_latent(cached.target_mean, cached.target_std, generator)
+        else:
+            latent = self.autoencoder.encode(batch.image, generator)
+        return latent - conditioning.base
 
     def decode_target(
         self, latent: Float[Tensor, "b z h2 w2"], conditioning: Conditioning

@@ -60,7 +60,7 @@ from extrap_train.tasks.results import (
     print_places,
     write_results,
 )
-from extrap_train.tasks.training_data import Prepare, data_module, require_unseen
+from extrap_train.tasks.training_data import Prepare, cached_encoder, data_module, require_unseen
 from extrap_train.terminal import terminal
 
 
@@ -80,7 +80,7 @@ def run(config: TrainConfig, prepare: Prepare) -> Outcome:
     model = _model(config)
     started = time.perf_counter()
     prepared = prepare(config)
-    data = data_module(config, prepared)
+    data = data_module(config, prepared, cached_encoder(config, model, prepared, console.print))
     seconds = {"prepare": time.perf_counter() - started}
     manifest = run_manifest(config, prepared)
     require_unseen(config.model.start, manifest)

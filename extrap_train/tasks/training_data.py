@@ -4,9 +4,12 @@ from collections.abc import Callable
 
 from extrap_train.config import TrainConfig
 from extrap_train.data.examples import ExampleReader
+from extrap_train.data.feature_files import FeatureFiles, FrameEncoder
 from extrap_train.data.module import PairModule
 from extrap_train.data.prepared import PreparedData
+from extrap_train.diffusion.frozen_features import frame_encoder, has_frozen_networks
 from extrap_train.diffusion.leakage import trainings_of
+from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError
 from extrap_train.store.manifest import Manifest
 
@@ -14,11 +17,15 @@ Prepare = Callable[[TrainConfig], list[PreparedData]]
 """Prepares every member of the category, or finds what was prepared before."""
 
 
-def data_module(config: TrainConfig, prepared: list[PreparedData]) -> PairModule:
-    """Training and held-out pairs; InputError where there are none of either."""
-    train, validation = (
-        ExampleReader(prepared, split, config.model.references) for split in ("train", "test")
-    )
+def data_module(
+    config: TrainConfig, prepared: list[PreparedData], encoder: FrameEncoder | None = None
+) -> PairModule:
+    """Training and held-out pairs; InputError where there are none of either.
+
+    Training reads what the `encoder` has said of its frames, where one is given.
+    """
+    train = ExampleReader(prepared, "train", config.model.references, encoder)
+    validation = ExampleReader(prepared, "test", config.model.references)
     for split, reader in (("training", train), ("test", validation)):
         if not len(reader):
             raise InputError(
@@ -26,6 +33,43 @@ def data_module(config: TrainConfig, prepared: list[PreparedData]) -> PairModule
                 f"and loosen the options under prep"
             )
     return PairModule(train, validation, config)
+
+
+def cached_encoder(
+    config: TrainConfig,
+    model: ExtrapolationModel,
+    prepared: list[PreparedData],
+    say: Callable[[str], None],
+) -> FrameEncoder | None:
+    """The encoder whose cached features `trainer.latents` asks for; None to compute them.
+
+    Raises InputError where they are asked for and not all there; with `auto` says what is done.
+    """
+    if config.trainer.latents == "computed":
+        return None
+    option = f"trainer.latents={config.trainer.latents}"
+    if not has_frozen_networks(config.model):
+        if config.trainer.latents == "auto":
+            return None
+        raise InputError(
+            f"{option}: model={config.model.name} has no frozen networks; leave it out"
+        )
+    encoder = frame_encoder(model)
+    files = [FeatureFiles(data, encoder) for data in prepared]
+    wanted = sum(len(each.sequences) for each in files)
+    missing = sum(len(each.missing()) for each in files)
+    if not missing:
+        say(f"{option}: frames of {wanted} training sequences were encoded before")
+        return encoder
+    lacking = (
+        f"{missing} of {wanted} training sequences are not encoded by these weights at "
+        f"{config.model.image_size} pixels; python -m data_prep with the same options, model="
+        f"{config.model.name} and model.start=… encodes them"
+    )
+    if config.trainer.latents == "cached":
+        raise InputError(f"{option}: {lacking}")
+    say(f"{option}: computed in every step ({lacking})")
+    return None
 
 
 def require_unseen(start: str | None, manifest: Manifest) -> None:

@@ -47,7 +47,7 @@ def test_a_weighed_model_learns_at_the_noisiest_step(config: ModelConfig, batch:
     model = ExtrapolationModel(config)
     torch.nn.init.normal_(model.unet.conv_out.weight, std=0.1)
     conditioning = model.condition(batch)
-    target = model.encode_target(batch.image, conditioning)
+    target = model.encode_target(batch, conditioning)
     noisiest = torch.full((len(target),), 999)
     errors = prediction_errors(model, target, torch.ones_like(target), noisiest, conditioning)
     (errors * snr_weights(model.schedule, noisiest, 5.0)).mean().backward()
@@ -85,7 +85,7 @@ def test_an_anchored_model_learns_the_truth_where_it_is_known_and_itself_elsewhe
     known = torch.zeros(3, config.image_size, config.image_size)
     known[..., : config.image_size // 2] = 1
     conditioning = model.condition(batch)
-    target = model.encode_target(batch.image, conditioning)
+    target = model.encode_target(batch, conditioning)
     noise, level = torch.ones_like(target), torch.tensor([100, 500, 900])
     told = (model, target, noise, level, conditioning)
     everywhere = Anchor(torch.ones_like(known), unchanged)

@@ -31,7 +31,7 @@ class Oracle(nn.Module):
     def __init__(self, model: ExtrapolationModel, batch: PairBatch) -> None:
         super().__init__()
         self.model, self.schedule = model, model.schedule
-        self.target = model.encode_target(batch.image, model.condition(batch))
+        self.target = model.encode_target(batch, model.condition(batch))
         self.condition, self.decode_target = model.condition, model.decode_target
 
     def forward(self, noisy: Tensor, timestep: Tensor, conditioning: Conditioning) -> Tensor:
