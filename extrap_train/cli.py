@@ -245,7 +245,9 @@ def help_text(options: CommandOptions, own_folders: Sequence[str] = ()) -> str:
         parts.append("Tasks:\n" + format_rows(options.tasks.items()))
     groups = [*options.groups, *options.file_groups]
     choices = [(f"{group}=", " | ".join(choices_of(group, own_folders))) for group in groups]
-    choices.append(("matcher@depth.matcher=", "the matcher of depth=monocular: depth.matcher.NAME"))
+    choices.append(
+        ("matcher@depth.matcher=", "the matcher of depth=monocular and files: depth.matcher.NAME")
+    )
     parts.append("Choices:\n" + format_rows(choices))
     for title, found in _sections(options):
         parts.append(f"{title}:\n" + format_rows(option.row for option in found))

@@ -27,6 +27,7 @@ GROUPS: dict[str, list[type]] = {
         schema.StereoConfig,
         schema.Mast3rConfig,
         schema.MonocularConfig,
+        schema.FilesDepthConfig,
         schema.OwnDepthConfig,
     ],
     "matcher": [

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 T = TypeVar("T")
-_SAME_SURFACE = 0.02
+SAME_SURFACE = 0.02
 """Relative difference of depth below which a resampled map is interpolated."""
 
 
@@ -115,6 +115,16 @@ def stack_poses(cameras: Sequence[Camera]) -> Camera:
 
 
 @dataclass(frozen=True)
+class WholePhotograph:
+    """The photograph that a view was cut from, as the capture has it."""
+
+    path: str
+    """Below the capture's root, with `/` between folders."""
+    camera: Camera
+    """Of the whole undistorted photograph, in the capture's own world."""
+
+
+@dataclass(frozen=True)
 class View:
     """A posed photograph, with its depth and object mask where they are known."""
 
@@ -123,6 +133,8 @@ class View:
     depth: Float[Tensor, "h w"] | None = None
     mask: Float[Tensor, "h w"] | None = None
     name: str = ""
+    photograph: WholePhotograph | None = None
+    """None for a view that is no photograph of a capture, as a generated one."""
 
     def cropped(self, top: int, left: int, height: int, width: int) -> "View":
         """The view's crop; the window must lie inside the image."""
@@ -181,7 +193,7 @@ def resample_surfaces(
     """
     nearest = functional.interpolate(maps[None], size, mode="nearest-exact")[0]
     smooth = functional.interpolate(maps[None], size, mode="bilinear", align_corners=False)[0]
-    same = (smooth[0] - nearest[0]).abs() < _SAME_SURFACE * nearest[0]
+    same = (smooth[0] - nearest[0]).abs() < SAME_SURFACE * nearest[0]
     return torch.where(same, smooth, nearest)
 
 

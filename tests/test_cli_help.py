@@ -31,7 +31,10 @@ def said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) ->
 
 @pytest.mark.parametrize(
     ("typed", "offered"),
-    [("category=hy", ["category=hydrant"]), ("depth=", ["dataset", "mast3r", "monocular"])],
+    [
+        ("category=hy", ["category=hydrant"]),
+        ("depth=", ["dataset", "files", "mast3r", "monocular"]),
+    ],
 )
 def test_the_shell_completes_choices_and_no_schemas(
     typed: str, offered: list[str], monkeypatch: pytest.MonkeyPatch, said: Said

@@ -24,6 +24,8 @@ _ORDER = (
     "extrap_train.processes",
     "extrap_train.metrics",
     "extrap_train.matching",
+    "extrap_train.data.paths",
+    "extrap_train.data.image_files",
     "extrap_train.depth",
     "extrap_train.data",
     "extrap_train.figures",

@@ -4,7 +4,12 @@ from pathlib import Path
 from typing import Any
 
 from extrap_train.config.commands import PAIR_TASKS, DataPrepConfig, TrainConfig, TrainerConfig
-from extrap_train.config.data_sources import Co3dConfig, PrepConfig, SyntheticConfig
+from extrap_train.config.data_sources import (
+    Co3dConfig,
+    FilesDepthConfig,
+    PrepConfig,
+    SyntheticConfig,
+)
 from extrap_train.config.model_options import (
     NEAREST_ALONE,
     ModelConfig,
@@ -84,6 +89,8 @@ def _check_files(config: TrainConfig | DataPrepConfig) -> None:
     for option, part in options.items():
         if hasattr(part, "checkpoint"):
             required_file(part.checkpoint, f"{option}.checkpoint", part.weights)
+    if isinstance(config.depth, FilesDepthConfig):
+        required_folder(config.depth.folder, "depth.folder", "the folder of the depth maps")
 
 
 def required_file(path: str | None, option: str, content: str) -> str:
@@ -91,6 +98,13 @@ def required_file(path: str | None, option: str, content: str) -> str:
     if not path:
         raise InputError(f"{option} is not given: give {option}=FILE, {content}")
     return path
+
+
+def required_folder(path: str | None, option: str, content: str) -> Path:
+    """`path`, if it is a folder; else InputError that says what `option` wants."""
+    if not path or not Path(path).is_dir():
+        raise InputError(f"{option}={path or ''}: is no folder; give {option}=FOLDER, {content}")
+    return Path(path)
 
 
 def _check_prep(prep: PrepConfig) -> None:

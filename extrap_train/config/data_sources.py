@@ -259,6 +259,31 @@ class MonocularConfig(DepthConfig):
 
 
 @dataclass
+class FilesDepthConfig(DepthConfig):
+    """Depth maps in files that another program has made; see docs/depth_files.md."""
+
+    name: str = "files"
+    has_network: ClassVar[bool] = False
+    folder: str | None = option(
+        None, "folder of depth maps, which are called like the photographs; required"
+    )
+    align: str = option(
+        "scene",
+        "what is solved for: one scale per scene or per view, or, for files of inverse depth "
+        "(affine), a scale and a shift per view",
+        known=("scene", "view", "affine"),
+    )
+    max_residual: float = option(
+        0.1, "median relative difference from other views beyond which depth is refused", low=0
+    )
+    image_size: int = option(
+        512, "longer side that depth is resampled to", unit="pixels", low=16, high=8192
+    )
+    matcher: MatcherConfig = MISSING
+    """Used by depth.align=affine; matcher@depth.matcher=aliked chooses another."""
+
+
+@dataclass
 class OwnDepthConfig(DepthConfig):
     """A class with the protocol of `extrap_train/depth`, named by a YAML."""
 

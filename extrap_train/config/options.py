@@ -13,7 +13,7 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 from extrap_train.errors import InputError
 
 MISSING: Any = "???"  # OmegaConf's mark for "must be given"
-_PATHS = ("root", "checkpoint", "depth_network")
+_PATHS = ("root", "checkpoint", "depth_network", "folder")
 _PATHS_OR_NAMES = ("model", "start")
 """What is not a path here is the name of weights in the package or in a cache of downloads."""
 PACKAGED_MODELS = Path(__file__).parents[1] / "weights"

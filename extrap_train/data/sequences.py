@@ -12,7 +12,7 @@ from extrap_train.data.depth_files import DepthFile
 from extrap_train.data.image_files import read_photograph
 from extrap_train.data.paths import require_file
 from extrap_train.geometry.lens import Lens, undistort
-from extrap_train.views import Camera, View
+from extrap_train.views import Camera, View, WholePhotograph
 
 NO_CATEGORY = "scene"
 """What stands for a category where a capture has none."""
@@ -92,6 +92,7 @@ class Photograph:
             depth=None if found is None else self._straighten(found, nearest=True),
             mask=None if mask is None else self._straighten(mask),
             name=self.name,
+            photograph=WholePhotograph(self.image_path, self.camera),
         )
 
     def _straighten(self, picture: Tensor, nearest: bool = False) -> Tensor:

@@ -115,7 +115,7 @@ class MonocularDepth:
         if count < LEAST_POINTS:
             raise NotAligned(
                 f"{name}: {count} of its points are found in other views, fewer than the "
-                f"{LEAST_POINTS} that depth=monocular needs for scale and shift; add photographs "
+                f"{LEAST_POINTS} that its scale and shift need; add photographs "
                 "or choose another depth.matcher"
             )
         points = combine(parts, torch.cat)
@@ -125,13 +125,13 @@ class MonocularDepth:
         if line is None:
             raise NotAligned(
                 f"{name}: the network says the same of all {count} points that are found in other "
-                "views; depth.model is unfit for this picture: try depth=stereo"
+                "views; the network is unfit for this picture: try depth=stereo"
             )
         if line.slope <= 0:
             raise NotAligned(
                 f"{name}: the network and the {count} points that are found in other views "
                 "contradict each other: what it takes for nearer is farther; matches or poses are "
-                "wrong, or depth.model is unfit: try another depth.matcher or depth=stereo"
+                "wrong, or the network is unfit: try another depth.matcher or depth=stereo"
             )
         explained = (line(at_points) * points.depth - 1).abs() <= EXPLAINED
         if not explained.any():

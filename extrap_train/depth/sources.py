@@ -8,6 +8,7 @@ from extrap_train.config import (
     AlikedMatcherConfig,
     DatasetDepthConfig,
     DepthConfig,
+    FilesDepthConfig,
     LoftrMatcherConfig,
     Mast3rConfig,
     MonocularConfig,
@@ -15,9 +16,11 @@ from extrap_train.config import (
     OwnMatcherConfig,
     StereoConfig,
     required_file,
+    required_folder,
 )
 from extrap_train.depth import DepthSource
 from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth.files import FilesDepth
 from extrap_train.depth.mast3r.mast3r_checkpoint import read_network
 from extrap_train.depth.mast3r.source import Mast3rDepth
 from extrap_train.depth.monocular import MonocularDepth
@@ -49,6 +52,11 @@ def depth_source(config: DepthConfig, device: torch.device | None = None) -> Dep
             network = read_depth_anything(config.model, device)
             found = matcher(config.matcher, "depth.matcher", device)
             return MonocularDepth(config, network, found)
+        case FilesDepthConfig():
+            folder = required_folder(config.folder, "depth.folder", "the folder of the depth maps")
+            is_affine = config.align == "affine"
+            matching = matcher(config.matcher, "depth.matcher", device) if is_affine else None
+            return FilesDepth(config, folder, matching)
         case OwnDepthConfig():
             name, prefix = f"depth={config.name}", "depth.options."
             own: DepthSource = make_object(
@@ -60,7 +68,7 @@ def depth_source(config: DepthConfig, device: torch.device | None = None) -> Dep
 
 
 def weight_files(options: object) -> list[Path]:
-    """The files that decide what a source or a matcher says: weights, and code of your own."""
+    """The files that decide what a source or a matcher says: weights, depth maps, code of yours."""
     match options:
         case Mast3rConfig() | LoftrMatcherConfig() | AlikedMatcherConfig():
             return [Path(options.checkpoint or "")]
@@ -68,7 +76,16 @@ def weight_files(options: object) -> list[Path]:
             from extrap_train.depth.depth_anything import files_read
 
             return [*files_read(options.model), *weight_files(options.matcher)]
+        case FilesDepthConfig():
+            files = sorted(path for path in Path(options.folder or "").rglob("*") if path.is_file())
+            return files + (weight_files(options.matcher) if options.align == "affine" else [])
         case OwnDepthConfig() | OwnMatcherConfig():
             return files_of(options.factory, options.options)
         case _:
             return []
+
+
+def source_of_generated(config: DepthConfig) -> DepthConfig:
+    """What gives generated views their depth: stereo where `config` knows photographs' alone."""
+    brought = isinstance(config, DatasetDepthConfig | FilesDepthConfig)
+    return StereoConfig() if brought else config

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from extrap_train.views import PairBatch, Warp, send
+from extrap_train.views import SAME_SURFACE, PairBatch, Warp, send
 
 _LOBES = 3
 
@@ -21,6 +21,20 @@ def sample_pixels(
     at = (pixels / size * 2 - 1).reshape(1, 1, -1, 2)
     found = functional.grid_sample(planes[None], at, padding_mode="border", align_corners=False)
     return found.reshape(len(planes), *pixels.shape[:-1])
+
+
+def sample_surfaces(
+    maps: Float[Tensor, "c h w"], pixels: Float[Tensor, "*n 2"]
+) -> Float[Tensor, "c ..."]:
+    """A depth map, the first of `maps`, and what lies on its surfaces, at (u, v).
+
+    Interpolated on a surface, by the nearest pixel at its edges, like `views.resample_surfaces`.
+    """
+    last = pixels.new_tensor([maps.shape[2] - 1, maps.shape[1] - 1])
+    u, v = pixels.clamp_min(0).floor().minimum(last).long().unbind(-1)
+    nearest, smooth = maps[:, v, u], sample_pixels(maps, pixels)
+    same = (smooth[0] - nearest[0]).abs() < SAME_SURFACE * nearest[0]
+    return torch.where(same, smooth, nearest)
 
 
 def lanczos_resize(

@@ -13,7 +13,6 @@ from rich.console import Console
 
 from extrap_train.config import (
     DatasetDepthConfig,
-    StereoConfig,
     SyntheticConfig,
     TrainConfig,
     dotted,
@@ -22,7 +21,7 @@ from extrap_train.data.scene_spec import SYNTHETIC_SCHEME, open_scene
 from extrap_train.data.sequences import NO_CATEGORY, Frame, FrameSequence
 from extrap_train.data.square_frames import load_readable, require_few_unusable
 from extrap_train.data.synthetic import SyntheticScene, build_scene
-from extrap_train.depth.sources import depth_source
+from extrap_train.depth.sources import depth_source, source_of_generated
 from extrap_train.device import advise_on_sampling_memory
 from extrap_train.errors import InputError
 from extrap_train.geometry.cameras import WorldFrame
@@ -227,9 +226,7 @@ def _pipeline(job: _Job) -> CompletionPipeline:
             config.seed,
         )
     generator = scene_generator(config, trained_model(config).to(device_of(config)))
-    # A generated view brings no depth along.
-    own = config.depth
-    source = depth_source(StereoConfig() if isinstance(own, DatasetDepthConfig) else own)
+    source = depth_source(source_of_generated(config.depth))
     predictor = None
     if job.depth_network is not None:
         predictor = NetworkDepth(load_depth_network(job.depth_network), source)

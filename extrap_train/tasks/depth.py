@@ -9,9 +9,6 @@ import numpy as np
 from rich.console import Console
 
 from extrap_train.config import (
-    DatasetDepthConfig,
-    DepthConfig,
-    StereoConfig,
     SyntheticConfig,
     TrainConfig,
     dotted,
@@ -19,7 +16,7 @@ from extrap_train.config import (
 from extrap_train.data.scene_spec import SYNTHETIC_SCHEME, open_scene
 from extrap_train.data.synthetic import build_scene, trace
 from extrap_train.data.synthetic.capture import sequence_name, walk_seed
-from extrap_train.depth.sources import depth_source
+from extrap_train.depth.sources import depth_source, source_of_generated
 from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.diffusion.packaged import packaged_name
 from extrap_train.errors import InputError
@@ -86,18 +83,12 @@ def _manifest(config: TrainConfig) -> Manifest:
         {
             "category": asdict(config.category),
             "data": asdict(config.data),
-            "depth": asdict(_measuring(config)),
+            "depth": asdict(source_of_generated(config.depth)),
         }
     )
     del options["data.train_sequences"]  # a run may be continued with more captures
     trainer = {f"trainer.{name}": getattr(config.trainer, name) for name in _TRAINER_OPTIONS}
     return Manifest.of(options | trainer | {"seed": config.seed})
-
-
-def _measuring(config: TrainConfig) -> DepthConfig:
-    """What measures generated views, which bring no depth along."""
-    own = config.depth
-    return StereoConfig() if isinstance(own, DatasetDepthConfig) else own
 
 
 def _example_file(folder: Path, category: str, index: int) -> Path:
@@ -115,7 +106,7 @@ def _draw_missing(
     """Draw the examples of every capture that has no file yet, with the packaged generators."""
     wanted = [(member, index) for index in indices for member in config.category.members]
     missing = [pair for pair in wanted if not _example_file(folder, *pair).is_file()]
-    source = depth_source(_measuring(config))
+    source = depth_source(source_of_generated(config.depth))
     generators = {member: _generator(member) for member in {member for member, _ in missing}}
     with progress("drawing examples", len(missing), "captures") as bar:
         for category, index in missing:

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from extrap_train.config import SyntheticConfig, TrainConfig, dotted
+from extrap_train.config import FilesDepthConfig, SyntheticConfig, TrainConfig, dotted
 from extrap_train.data.scene_spec import SYNTHETIC_SCHEME, open_scene, scene_address
 from extrap_train.data.sequences import NO_CATEGORY, Frame, FrameSequence
 from extrap_train.data.square_frames import input_views, select_input_frames
@@ -134,15 +134,22 @@ def scene_manifest(
         "trainer.precision": config.trainer.precision,
         "seed": config.seed,
     }
-    depth_files = [path for path in weight_files(config.depth) if path.is_file()]
+    depth_files = {_depth_label(f, config): f for f in weight_files(config.depth) if f.is_file()}
     return Manifest.of(
         dotted(common) | dict(options),
         {
             **weights,
-            **{f"weights of depth ({path.name})": file_digest(path) for path in depth_files},
+            **{f"weights of depth ({name})": file_digest(f) for name, f in depth_files.items()},
             **{f"photograph {name}": d for name, d in photograph_digests(frames).items()},
         },
     )
+
+
+def _depth_label(path: Path, config: TrainConfig) -> str:
+    """Depth maps of several folders may have the same name."""
+    if isinstance(config.depth, FilesDepthConfig) and path.is_relative_to(str(config.depth.folder)):
+        return path.relative_to(str(config.depth.folder)).as_posix()
+    return path.name
 
 
 def result_folder(config: TrainConfig, label: str) -> Path:

@@ -13,7 +13,7 @@ from extrap_train.data.synthetic.categories import build_scene
 from extrap_train.data.synthetic.parts import SyntheticScene
 from extrap_train.data.synthetic.render import render
 from extrap_train.geometry.orbits import looking_at
-from extrap_train.views import Camera, View
+from extrap_train.views import Camera, View, WholePhotograph
 
 
 def sequence_name(index: int) -> str:
@@ -38,18 +38,20 @@ def synthetic_sequence(category: str, index: int, options: SyntheticConfig) -> F
     frames = []
     for number in range(options.frames):
         name, camera = f"frame{number:06d}", cameras[number]
-        frames.append(Frame(name, camera, True, True, _Renderer(scene, camera, name).load, ()))
+        whole = WholePhotograph(f"{category}/{sequence_name(index)}/{name}", camera)
+        frames.append(Frame(name, camera, True, True, _Renderer(scene, whole, name).load, ()))
     return FrameSequence(category, sequence_name(index), tuple(frames))
 
 
 @dataclass(frozen=True)
 class _Renderer:
     scene: SyntheticScene
-    camera: Camera
+    photograph: WholePhotograph
     name: str
 
     def load(self, *, depth: bool = True) -> View:
-        view = replace(render(self.scene, self.camera), name=self.name)
+        view = render(self.scene, self.photograph.camera)
+        view = replace(view, name=self.name, photograph=self.photograph)
         return view if depth else replace(view, depth=None)
 
 

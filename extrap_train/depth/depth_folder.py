@@ -1,0 +1,182 @@
+"""Depth maps that another program has written, one file per photograph; see docs/depth_files.md."""
+
+import tokenize
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import IO
+
+import numpy as np
+import torch
+from jaxtyping import Float, Shaped
+from torch import Tensor
+
+from extrap_train.data.image_files import MAX_PIXELS, image_size, read_picture
+from extrap_train.data.paths import require_file
+from extrap_train.errors import InputError
+from extrap_train.views import Camera, WholePhotograph
+
+SUFFIXES = (".npz", ".npy", ".png")
+LARGEST_ASPECT_CHANGE = 0.06
+"""Networks round both sides to multiples of their patch."""
+LARGEST_FOCAL_CHANGE = 0.02
+LARGEST_SHIFT = 0.02
+"""Of the principal point, as a share of the side."""
+LARGEST_TURN_DEG = 1.0
+LARGEST_STEP = 0.01
+"""Between the two positions of a camera, as a share of the cameras' extent."""
+_LARGEST_HEADER = 4096
+_DAMAGE = (
+    *(OSError, EOFError, ValueError, TypeError, SyntaxError, ArithmeticError, RecursionError),
+    *(MemoryError, NotImplementedError, RuntimeError, tokenize.TokenError),
+    *(zipfile.BadZipFile, zlib.error),
+)
+"""What zipfile and NumPy raise on damaged files."""
+
+
+@dataclass(frozen=True)
+class StoredDepth:
+    """One file: a map of the whole undistorted photograph at any size, in any unit."""
+
+    file: Path
+    depth: Float[Tensor, "h w"]
+    """As it is stored, but 0 where it is not finite."""
+    confidence: Float[Tensor, "h w"]
+    """Not negative; 1 everywhere if the file has none."""
+    intrinsics: Float[Tensor, "3 3"] | None = None
+    """At the size of the map."""
+    world_to_cam: Float[Tensor, "4 4"] | None = None
+
+
+def find_depth_file(folder: Path, photograph: WholePhotograph) -> Path | None:
+    """The photograph's depth file: its path with a suffix replaced or added; None if none is there.
+
+    InputError if there is more than one.
+    """
+    path = folder / PurePosixPath(photograph.path)
+    names = [path.with_suffix(suffix) for suffix in SUFFIXES]
+    names += [path.with_name(path.name + suffix) for suffix in SUFFIXES]
+    found = [name for name in dict.fromkeys(names) if name.is_file()]
+    if len(found) > 1:
+        raise InputError(f"{found[0]}: {found[1].name} is beside it; keep one of the two")
+    return found[0] if found else None
+
+
+def read_depth_file(file: Path) -> StoredDepth:
+    """Read an NPZ, NPY or greyscale PNG file; InputError if it is damaged, too large or empty."""
+    arrays = {"depth": _read_png(file)} if file.suffix == ".png" else _read_arrays(file)
+    if "depth" not in arrays:
+        raise InputError(f"{file}: has no array `depth`; write one")
+    depth = arrays["depth"]
+    confidence = arrays.get("confidence", np.ones(depth.shape, np.float32))
+    shapes = {"confidence": depth.shape, "intrinsics": (3, 3), "world_to_cam": (4, 4)}
+    for name, shape in shapes.items():
+        if name in arrays and arrays[name].shape != shape:
+            raise InputError(f"{file}: `{name}` is {arrays[name].shape}, not {shape}; correct it")
+    if depth.ndim != 2 or not depth.any():
+        raise InputError(
+            f"{file}: `depth` of shape {depth.shape} is zero everywhere or no map of height x "
+            "width; restore or remove the file"
+        )
+    camera = {name: _matrix(arrays[name], name, file) for name in [*shapes][1:] if name in arrays}
+    return StoredDepth(
+        file, torch.from_numpy(depth), torch.from_numpy(confidence).clamp_min(0), **camera
+    )
+
+
+def require_same_camera(stored: StoredDepth, camera: Camera, extent: float) -> None:
+    """InputError if the file's shape, intrinsics or pose are not those of the photograph's camera.
+
+    `extent` is the cameras' extent in the capture's world.
+    """
+    height, width = stored.depth.shape
+    across, down = width / camera.width, height / camera.height
+    if not abs(across / down - 1) <= LARGEST_ASPECT_CHANGE:
+        raise InputError(
+            f"{stored.file}: has {height} x {width} values (height x width), but the photograph "
+            f"is of {camera.height} x {camera.width} pixels; a file must cover the whole of it"
+        )
+    if stored.intrinsics is not None:
+        scaled = camera.resized(height, width).intrinsics.double()
+        ours, theirs = scaled.cpu(), stored.intrinsics
+        focal = (theirs.diagonal()[:2] / ours.diagonal()[:2] - 1).abs().max()
+        shift = ((theirs - ours)[:2, 2] / torch.tensor([width, height])).abs().max()
+        if not (focal <= LARGEST_FOCAL_CHANGE and shift <= LARGEST_SHIFT):
+            raise InputError(
+                f"{stored.file}: its focal length and principal point {_lens(theirs)} are not the "
+                f"scene's {_lens(ours)} at {height} x {width}; use the scene's own intrinsics"
+            )
+    if stored.world_to_cam is not None:
+        ours, theirs = camera.world_to_cam.double().cpu(), stored.world_to_cam
+        cosine = ((ours[:3, :3] @ theirs[:3, :3].mT).trace() - 1) / 2
+        turn_deg = float(cosine.clamp(-1, 1).arccos().rad2deg())
+        step = float((_center(ours) - _center(theirs)).norm()) / max(extent, 1e-12)
+        if not (turn_deg <= LARGEST_TURN_DEG and step <= LARGEST_STEP):
+            raise InputError(
+                f"{stored.file}: its world_to_cam is turned by {turn_deg:.1f}° and moved by "
+                f"{step:.0%} of the cameras' extent against the scene's; store the scene's own "
+                "pose or none"
+            )
+
+
+def _center(world_to_cam: Float[Tensor, "4 4"]) -> Float[Tensor, "3"]:
+    return -world_to_cam[:3, :3].mT @ world_to_cam[:3, 3]
+
+
+def _lens(intrinsics: Float[Tensor, "3 3"]) -> str:
+    k = intrinsics
+    return f"({k[0, 0]:.0f}, {k[1, 1]:.0f}, {k[0, 2]:.0f}, {k[1, 2]:.0f})"
+
+
+def _matrix(values: Shaped[np.ndarray, "n n"], name: str, file: Path) -> Float[Tensor, "n n"]:
+    if not np.linalg.det(values):
+        raise InputError(f"{file}: `{name}` is no matrix of a camera; correct or leave it out")
+    return torch.from_numpy(values).double()
+
+
+def _read_png(file: Path) -> Float[np.ndarray, "h w"]:
+    size = image_size(file)
+    picture = read_picture(file, size, ("I;16", "I;16B", "I"), resize=False)
+    return np.asarray(picture).astype(np.float32)
+
+
+def _read_arrays(file: Path) -> dict[str, Float[np.ndarray, "..."]]:
+    """The arrays that are known, by their name; that of an NPY file is the depth."""
+    require_file(file)
+    try:
+        with file.open("rb") as stream:
+            if file.suffix == ".npy":
+                return {"depth": _read_array(stream)}
+            arrays = {}
+            with zipfile.ZipFile(stream) as archive:
+                for name in {"depth", "confidence", "intrinsics", "world_to_cam"}:
+                    if f"{name}.npy" in archive.NameToInfo:
+                        with archive.open(f"{name}.npy") as part:
+                            arrays[name] = _read_array(part)
+            return arrays
+    except _DAMAGE as error:
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{file}: is truncated, damaged or too large ({reason})") from None
+
+
+def _read_array(stream: IO[bytes]) -> Float[np.ndarray, "..."]:
+    """Numbers of an NPY stream in single precision; ValueError unless the header is plausible.
+
+    No more is read than the header says, and never more than `MAX_PIXELS` numbers.
+    """
+    read_header = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }[np.lib.format.read_magic(stream)]
+    shape, is_fortran, dtype = read_header(stream, max_header_size=_LARGEST_HEADER)
+    count = int(np.prod(shape, dtype=object))
+    if dtype.kind not in "fiu" or not 0 < count <= MAX_PIXELS:
+        raise ValueError(f"it holds {dtype} of shape {shape}")
+    content = stream.read(count * dtype.itemsize)
+    if len(content) != count * dtype.itemsize:
+        raise ValueError(f"{len(content)} bytes instead of {count * dtype.itemsize}")
+    values = np.frombuffer(content, dtype).reshape(shape, order="F" if is_fortran else "C")
+    with np.errstate(invalid="ignore", over="ignore"):
+        numbers = np.squeeze(values).astype(np.float32)
+    return np.ascontiguousarray(np.where(np.isfinite(numbers), numbers, 0))
