@@ -133,12 +133,13 @@ class Fixed:
     ("count", "step", "reason"),
     [
         (0, torch.zeros(0, 2), "only 0 matches"),
+        (39, torch.zeros(39, 2), "only 39 matches"),
         (300, torch.zeros(300, 2), "no motion in common"),
         (300, torch.tensor([6.0, 0.0]).repeat(300, 1), "comes no closer"),
         (300, torch.tensor([0.0, 6.0]).repeat(300, 1), "off their epipolar lines"),
         (300, 40 * torch.randn(300, 2, generator=torch.Generator().manual_seed(0)), "off their"),
     ],
-    ids=["none", "still", "wrong but unanimous", "across", "chance"],
+    ids=["none", "few", "still", "wrong but unanimous", "across", "chance"],
 )
 def test_useless_matches_leave_the_warp_alone(count: int, step, reason: str) -> None:
     reference, query = orbit_camera(0, size=SIZE), orbit_camera(15, size=SIZE)

@@ -63,6 +63,15 @@ def test_a_line_and_a_point_and_a_panorama_are_no_circles() -> None:
     assert not judge(capture(outwards), OPTIONS).kept
 
 
+@pytest.mark.parametrize(("every", "kept"), [(6, False), (12, True)])
+def test_a_tenth_of_the_cameras_may_look_away(every: int, kept: bool) -> None:
+    circle = ring(even(24), 0)
+    circle.world_to_cam[::every, [0, 2]] *= -1
+    verdict = judge(capture(circle), OPTIONS)
+    assert verdict.kept == kept
+    assert ("face a common centre" in verdict.reason) == (not kept)
+
+
 def test_overhead_views_do_not_fill_a_gap() -> None:
     half, top = ring(even(12, 180)), ring(even(12), 85)
     both = torch.cat([half.world_to_cam, top.world_to_cam])

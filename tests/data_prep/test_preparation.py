@@ -82,6 +82,12 @@ def test_other_pair_options_keep_the_frames_other_sizes_do_not(tmp_path: Path) -
     assert len(depth.calls[0]) == 6
 
 
+def test_other_test_sequences_are_taken_for_another_preparation(tmp_path: Path) -> None:
+    for name in ("0001", "0002"):
+        data = run(tmp_path / "cup", captures(3), test_names=[name])
+        assert [key for key, role in data.roles.items() if role == "test"] == [f"cup/{name}"]
+
+
 def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
     depth = CountingDepth(calls=([],))
 

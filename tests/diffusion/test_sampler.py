@@ -83,6 +83,8 @@ def test_a_view_does_not_depend_on_its_batch(
     alone = sample_views(model, batch, options, "xbz", seed=1)
     torch.testing.assert_close(together[1], alone[1], atol=1e-5, rtol=0)
     assert (together[0] - alone[0]).abs().max() > 1e-3, "another name is another noise"
+    again = sample_views(model, batch, options, "abc", seed=2)
+    assert (together - again).abs().amax((1, 2, 3)).min() > 1e-3, "another seed is, too"
 
 
 def test_guidance_of_one_is_the_conditional_prediction(

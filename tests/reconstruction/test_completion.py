@@ -21,7 +21,7 @@ from extrap_train.reconstruction.global_map import GENERATED, GlobalMap, Prior, 
 from extrap_train.reconstruction.map_files import load_map, save_view
 from extrap_train.reconstruction.measurement import Measured, supported
 from extrap_train.reconstruction.new_view import propose
-from extrap_train.reconstruction.planner import orbit_queries
+from extrap_train.reconstruction.planner import Query, next_query, orbit_queries
 from extrap_train.views import Camera, View, stack_cameras
 
 SIZE = 64
@@ -170,6 +170,13 @@ def test_views_are_generated_from_the_photographs_alone_or_from_all_views(whole)
     assert chained.views[3].origin.references == whole[0].views[3].origin.references
 
 
+def test_branches_grow_in_turn():
+    """Of two queries that are as near and as well covered, the one farther from the newest view."""
+    queries = [Query(f"{a:g}", scenes.orbit_camera(a, size=SIZE)) for a in (60.0, -60.0)]
+    assert next_query(inputs(-30.0, 0.0, 30.0), queries).name == "-60"
+    assert next_query(inputs(30.0, 0.0, -30.0), queries).name == "60"
+
+
 def test_two_branches_meet_and_hardly_disagree(whole):
     known, steps = whole
     roots = {view.origin.root for view in known.views if view.origin.kind == GENERATED}
@@ -253,6 +260,15 @@ def test_a_view_is_as_sure_as_what_bears_it_out():
     assert with_three > 0.6
     assert with_one == pytest.approx(with_three * (1 / 2) / (3 / 4), rel=0.05)
     assert surest(wrong, OneEdge()) < 0.7 * with_one
+
+
+def test_where_both_agree_the_surer_of_map_and_view_counts():
+    known = inputs(-30.0, 0.0, 30.0)
+    sound = replace(photograph(scenes.orbit_camera(60.0, size=SIZE)), depth=None)
+    prior = prior_of(known, sound.camera, [2, 1, 0])
+    proposal = propose(known, sound, [2, 1, 0], OneEdge(), ConfidenceConfig())
+    as_sure = proposal.confidence >= prior.confidence - 1e-3
+    assert as_sure[prior.mask].float().mean() > 0.9
 
 
 def test_behind_a_surface_that_the_map_shows_as_surely_nothing_enters():
