@@ -12,7 +12,7 @@ from benchmarks.protocol.draws import Protocol, draw_sequence, farthest_frames, 
 from extrap_train.config import RulesConfig
 from extrap_train.errors import InputError
 from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
-from tests.orbits import even, ring
+from tests.orbits import even, looking_at, ring
 
 _RULES = RulesConfig(seeds=[0, 1])
 _CAMERAS = ring(even(36))
@@ -29,6 +29,11 @@ def test_nine_of_a_ring_are_spread_over_all_of_it() -> None:
     assert len(set(pool)) == 9
     assert gaps.min() >= 20
     assert gaps.max() <= 50
+
+
+def test_the_pool_begins_at_the_camera_nearest_to_the_middle() -> None:
+    positions = np.array([[x, -3.0, 0.0] for x in (0.0, 1.0, 2.0, 3.0, 10.0)])
+    assert farthest_frames(looking_at(positions, np.zeros(3)), 2) == [3, 4]
 
 
 def test_inputs_and_targets_divide_the_same_pool() -> None:
