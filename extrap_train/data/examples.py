@@ -7,10 +7,12 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any, TypeVar
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
+from torch.utils.data import default_collate
 
 from extrap_train.data.camera_check import is_degenerate
 from extrap_train.data.feature_files import FeatureFiles, FrameEncoder
@@ -67,15 +69,24 @@ def mirror(example: Example) -> Example:
     flows, flip = example.reference_flows, torch.tensor([-1.0, 1.0])[:, None, None]
     return replace(
         example,
-        image=None if example.image is None else example.image.flip(-1),
+        image=None if example.image is None else _mirror_pictures(example.image),
         camera=_mirror_camera(example.camera),
-        reference_images=example.reference_images.flip(-1),
+        reference_images=_mirror_pictures(example.reference_images),
         reference_cameras=_mirror_camera(example.reference_cameras),
-        reference_depths=example.reference_depths.flip(-1),
+        reference_depths=_mirror_pictures(example.reference_depths),
         reference_flows=None if flows is None else flows.flip(-1) * flip,
         object_mask=None if example.object_mask is None else example.object_mask.flip(-1),
         features=combine([example.features], lambda both: both[0].flip(0)),
     )
+
+
+def _mirror_pictures(pictures: Shaped[Tensor, "*n h w"]) -> Shaped[Tensor, "*n h w"]:
+    """`pictures.flip(-1)`, ten times as fast for bytes."""
+    height, width = pictures.shape[-2:]
+    rows = pictures.contiguous().view(-1, width)
+    kind = {1: torch.uint8, 2: torch.int16, 4: torch.int32}[pictures.element_size()]
+    flipped = torch.from_numpy(cv2.flip(rows.view(kind).numpy(), 1))
+    return flipped.view(pictures.dtype).view(*pictures.shape[:-2], height, width)
 
 
 def _mirror_camera(camera: Camera) -> Camera:
@@ -135,7 +146,8 @@ def _gather(
 ) -> Shaped[Tensor, "b k *c h w"]:
     """The chosen pictures of every example, each copied once."""
     chosen = [part[i] for part, order in zip(parts, orders, strict=True) for i in order]
-    return torch.stack(chosen).unflatten(0, (len(parts), -1))
+    # In a worker, torch's function writes to memory that it shares with the training process.
+    return default_collate(chosen).unflatten(0, (len(parts), -1))
 
 
 def _flows(

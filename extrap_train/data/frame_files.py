@@ -5,7 +5,7 @@ import json
 import math
 import re
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -88,37 +88,46 @@ class StoredFrames:
         """The sequence's unit of depth in scene units."""
         return float(self._table["depth_scale"][0].as_py())
 
-    def image(self, index: int) -> UInt8[Tensor, "3 h w"]:
-        """The photograph's bytes of colour."""
-        return torch.from_numpy(self._decode(index, 0, decode_image))
+    def images(self, indices: Sequence[int]) -> UInt8[Tensor, "k 3 h w"]:
+        """The photographs' bytes of colour."""
+        return self._decode(indices, 0, decode_image, (3, self._side, self._side), np.uint8)
 
-    def depth(self, index: int) -> Float16[Tensor, "h w"]:
-        """The depth map in the sequence's unit; 0 is unknown."""
-        return torch.from_numpy(self._decode(index, 1, decode_depth))
+    def depths(self, indices: Sequence[int]) -> Float16[Tensor, "k h w"]:
+        """The depth maps in the sequence's unit; 0 is unknown."""
+        return self._decode(indices, 1, decode_depth, (self._side, self._side), np.float16)
 
     def mask(self, index: int) -> Bool[Tensor, "h w"]:
         """Where the frame shows the object; everywhere where the capture has no mask."""
-        return torch.from_numpy(self._decode(index, 2, decode_mask))
+        return self._decode([index], 2, decode_mask, (self._side, self._side), np.bool_)[0]
 
     def view(self, index: int) -> View:
         """A frame with its depth in scene units; 0 is unknown."""
-        image = self.image(index).float().div_(255)
-        depth = self.depth(index).float().mul_(self.depth_scale)
+        image = self.images([index])[0].float().div_(255)
+        depth = self.depths([index])[0].float().mul_(self.depth_scale)
         return View(image, self.camera[index], depth)
 
     def _decode(
-        self, index: int, part: int, decode: Callable[[np.ndarray, int], np.ndarray]
-    ) -> np.ndarray:
-        content = np.asarray(self._content[self._starts[index, part] : self._ends[index, part]])
-        try:
-            if zlib.crc32(content.data) != self._checksums[index, part]:
-                raise ValueError("not what was written")
-            return decode(content, self._side)
-        except ValueError as error:
-            raise InputError(
-                f"{self._file} is damaged ({_PARTS[part]} of frame {index}: {error}); delete its "
-                "folder and run data_prep again"
-            ) from None
+        self,
+        indices: Sequence[int],
+        part: int,
+        decode: Callable[[np.ndarray, np.ndarray], None],
+        shape: tuple[int, ...],
+        dtype: type[np.generic],
+    ) -> Tensor:
+        """One part of some frames, each decoded to where it stays."""
+        decoded = np.empty((len(indices), *shape), dtype)
+        for index, target in zip(indices, decoded, strict=True):
+            content = np.asarray(self._content[self._starts[index, part] : self._ends[index, part]])
+            try:
+                if zlib.crc32(content.data) != self._checksums[index, part]:
+                    raise ValueError("not what was written")
+                decode(content, target)
+            except ValueError as error:
+                raise InputError(
+                    f"{self._file} is damaged ({_PARTS[part]} of frame {index}: {error}); delete "
+                    "its folder and run data_prep again"
+                ) from None
+        return torch.from_numpy(decoded)
 
 
 def damaged_error(place: Path, what: str) -> InputError:

@@ -27,6 +27,7 @@ import torch
 from jaxtyping import Bool, Float, Float16, Int, UInt8
 from torch import Tensor
 
+from extrap_train.config import PrepConfig, options_of
 from extrap_train.data.frame_files import (
     FLOWS,
     REMEDY,
@@ -44,6 +45,7 @@ from extrap_train.store.records import read_record
 from extrap_train.views import Camera, ViewPair
 
 FORMAT = 6
+_LARGEST_SIZE = options_of(PrepConfig)["image_size"].declared.high
 UNTOUCHED = -1
 """Flow number of a pair without a flow: its warp stays as it is."""
 _REPEATED = ("sequence", "split", "uncorrected")
@@ -189,13 +191,11 @@ class PreparedData:
 
     def images(self, sequence: str, indices: Sequence[int]) -> UInt8[Tensor, "k 3 h w"]:
         """The colours of some frames, as bytes."""
-        archive = self._archive(sequence)
-        return torch.stack([archive.image(index) for index in indices])
+        return self._archive(sequence).images(indices)
 
     def depths(self, sequence: str, indices: Sequence[int]) -> Float16[Tensor, "k h w"]:
         """Depth of some frames in units of `depth_unit`; 0 is unknown."""
-        archive = self._archive(sequence)
-        return torch.stack([archive.depth(index) for index in indices])
+        return self._archive(sequence).depths(indices)
 
     def mask(self, sequence: str, index: int) -> Bool[Tensor, "h w"]:
         """Where a frame shows the object; everywhere where the capture has no mask."""
@@ -275,7 +275,7 @@ def read_preparation(folder: Path) -> dict[str, Any]:
         raise InputError(f"{folder}: holds no finished preparation; run data_prep again")
     manifest = read_record(file, _Manifest, REMEDY)
     size = manifest.options.get("image_size")
-    if manifest.format != FORMAT or type(size) is not int:
+    if manifest.format != FORMAT or type(size) is not int or not 1 <= size <= _LARGEST_SIZE:
         raise damaged_error(folder, f"{file} is not a manifest of format {FORMAT}")
     return asdict(manifest)
 

@@ -30,7 +30,7 @@ MOST_UNUSABLE_SHARE = 0.1
 """Share of unusable frames beyond which the whole sequence is not trusted."""
 LEAST_FRAMES = 2
 """While so many are left, one unusable frame alone does not discredit a sequence."""
-FRAMES_VERSION = 3
+FRAMES_VERSION = 4
 """Raised whenever the same photographs give other frames."""
 LOG = logging.getLogger(__name__)
 

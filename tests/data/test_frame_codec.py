@@ -34,8 +34,15 @@ CONTENTS = {
 }
 
 
-def _bytes(content: bytes) -> np.ndarray:
-    return np.frombuffer(content, np.uint8)
+def _decoded(decode, content: bytes, side: int) -> np.ndarray:
+    shape, dtype = {
+        decode_image: ((3, side, side), np.uint8),
+        decode_depth: ((side, side), np.float16),
+        decode_mask: ((side, side), np.bool_),
+    }[decode]
+    target = np.empty(shape, dtype)
+    decode(np.frombuffer(content, np.uint8), target)
+    return target
 
 
 @given(bits=arrays(np.uint16, (5, 5)))
@@ -43,19 +50,21 @@ def _bytes(content: bytes) -> np.ndarray:
 def test_any_depth_comes_back_to_the_bit(bits: np.ndarray) -> None:
     """Infinities and what is not a number among them."""
     depth = bits.view(np.float16)
-    assert np.array_equal(decode_depth(_bytes(encode_depth(depth)), 5).view(np.uint16), bits)
+    assert np.array_equal(_decoded(decode_depth, encode_depth(depth), 5).view(np.uint16), bits)
 
 
 @given(mask=arrays(bool, (7, 7)))
 @settings(max_examples=50, deadline=None)
 def test_any_mask_comes_back(mask: np.ndarray) -> None:
-    assert np.array_equal(decode_mask(_bytes(encode_mask(mask)), 7), mask)
+    assert np.array_equal(_decoded(decode_mask, encode_mask(mask), 7), mask)
 
 
 @given(pixels=arrays(np.uint8, (9, 9, 3)))
 @settings(max_examples=50, deadline=None)
 def test_a_small_photograph_comes_back_to_the_bit(pixels: np.ndarray) -> None:
-    assert np.array_equal(decode_image(_bytes(encode_image(pixels)), 9), pixels.transpose(2, 0, 1))
+    assert np.array_equal(
+        _decoded(decode_image, encode_image(pixels), 9), pixels.transpose(2, 0, 1)
+    )
 
 
 @given(side=st.integers(LOSSY_FROM, 2 * LOSSY_FROM), seed=st.integers(0, 9))
@@ -63,7 +72,7 @@ def test_a_small_photograph_comes_back_to_the_bit(pixels: np.ndarray) -> None:
 def test_a_large_photograph_keeps_its_colours_and_their_order(side: int, seed: int) -> None:
     coarse = np.random.default_rng(seed).integers(0, 255, (8, 8, 3)).astype(np.uint8)
     image = cv2.resize(coarse, (side, side), interpolation=cv2.INTER_CUBIC)
-    again = decode_image(_bytes(encode_image(image)), side)
+    again = _decoded(decode_image, encode_image(image), side)
     error = again.transpose(1, 2, 0).astype(float) - image
     assert np.abs(error.mean((0, 1))).max() < 0.5
     assert (error**2).mean() < 4
@@ -72,8 +81,8 @@ def test_a_large_photograph_keeps_its_colours_and_their_order(side: int, seed: i
 @pytest.mark.parametrize("name", list(CONTENTS))
 @pytest.mark.parametrize("decode", [decode_image, decode_depth, decode_mask])
 def test_other_bytes_are_an_error(decode, name: str) -> None:
-    with pytest.raises(ValueError, match=r"16 x 16|no photograph"):
-        decode(_bytes(CONTENTS[name]), 16)
+    with pytest.raises(ValueError, match="16 x 16"):
+        _decoded(decode, CONTENTS[name], 16)
 
 
 @pytest.mark.parametrize("category", ["apple", "hydrant"])
@@ -82,7 +91,7 @@ def test_frames_of_real_captures_stay_small(shared, category: str) -> None:
     frame = read_category(shared / "data" / "co3d", category)[0].frames[0]
     image = to_eight_bits(object_square(frame.load(depth=False), 512).image).transpose(1, 2, 0)
     content = encode_image(np.ascontiguousarray(image))
-    again = torch.from_numpy(decode_image(_bytes(content), 512)).double()
+    again = torch.from_numpy(_decoded(decode_image, content, 512)).double()
     error = (again - torch.from_numpy(image.transpose(2, 0, 1).copy())).square().mean()
     assert len(content) < 140 * KILOBYTE
     assert 10 * torch.log10(255**2 / error) > 40
