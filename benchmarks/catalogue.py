@@ -49,7 +49,21 @@ class Catalogue:
         return [n for n in names if len(self.content("category", n).get("members", ())) == 1]
 
     def content(self, kind: str, name: str) -> dict[str, Any]:
-        """A YAML's content as it stands; raises InputError for an unknown name."""
+        """A YAML's content; raises InputError for an unknown name.
+
+        A table that `extends` another one has what it does not say itself from there.
+        """
+        content = self._read(kind, name)
+        chain = [name]
+        while kind == "table" and (base := content.pop("extends", None)):
+            if base in chain:
+                raise InputError(f"table {name}: extends itself ({' > '.join([*chain, base])})")
+            chain.append(str(base))
+            merged = OmegaConf.merge(self._read(kind, chain[-1]), content)
+            content = OmegaConf.to_container(merged)  # type: ignore[assignment]
+        return content
+
+    def _read(self, kind: str, name: str) -> dict[str, Any]:
         for folder in [*reversed(self.own), conf.__path__[0]]:
             if (file := Path(folder) / kind / f"{name}.yaml").is_file():
                 return read_yaml(file, "correct it")

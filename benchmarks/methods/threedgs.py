@@ -11,13 +11,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks.methods.base import SceneInputs, Stopwatch, Synthesis, photographs_used
+from benchmarks.methods.base import (
+    SceneInputs,
+    Stopwatch,
+    Synthesis,
+    Unavailable,
+    photographs_used,
+)
 from extrap_train.config.options import option
 from extrap_train.depth import DepthMap, DepthSource, PointMaps
+from extrap_train.device import fastest_device
 from extrap_train.errors import InputError
 from extrap_train.gaussians.fit import Fit, fit
-from extrap_train.gaussians.gaussian_options import GaussianOptions
+from extrap_train.gaussians.gaussian_options import RASTERIZERS, GaussianOptions
 from extrap_train.gaussians.init import Points, parameters_from_points
+from extrap_train.gaussians.rasterize import rasterizer
 from extrap_train.gaussians.recipe import Recipe
 from extrap_train.gaussians.training_scene import TrainingScene, training_scene
 from extrap_train.views import View
@@ -63,6 +71,11 @@ class AffineSurrogate:
         return replace(found, depth=mapped * known)
 
 
+_AUTO = "auto"
+_CHOICES = (_AUTO, *RASTERIZERS)
+_RASTERIZER_ON = {device: name for name, device in RASTERIZERS.items()}
+
+
 @dataclass(frozen=True)
 class ThreeDgs(GaussianOptions):
     """Fits Gaussians to the inputs, from points that these alone give, and draws the targets.
@@ -74,6 +87,16 @@ class ThreeDgs(GaussianOptions):
     recipe: ClassVar[type[Recipe]] = Recipe
     """What the method does in the training loop."""
 
+    rasterizer: str = option(
+        "auto", "numba on the CPU, gsplat on a GPU; auto: gsplat if there is a GPU", known=_CHOICES
+    )
+
+    def __post_init__(self) -> None:
+        """Choose the rasteriser of this process's device; InputError for an option out of range."""
+        super().__post_init__()
+        if self.rasterizer == _AUTO:
+            object.__setattr__(self, "rasterizer", _RASTERIZER_ON[fastest_device().type])
+
     def weight_files(self, category: str) -> Sequence[Path]:
         """No files: nothing is pre-trained."""
         return ()
@@ -84,7 +107,14 @@ class ThreeDgs(GaussianOptions):
         return fit(self.recipe(self, scene))
 
     def synthesize(self, inputs: SceneInputs) -> Synthesis:
-        """Fit, and draw every target; the time is that of preprocessing and optimisation."""
+        """Fit, and draw every target; the time is that of preprocessing and optimisation.
+
+        Raises Unavailable where the rasteriser cannot run.
+        """
+        try:
+            rasterizer(self.rasterizer)
+        except InputError as error:
+            raise Unavailable(str(error)) from None
         self._warm_up(inputs)
         with Stopwatch() as watch:
             trained = self.fit_scene(inputs)

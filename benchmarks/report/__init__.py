@@ -1,5 +1,6 @@
 """A table's reports: tidy and mean CSV, Markdown, LaTeX, plots and one self-contained page."""
 
+import logging
 from pathlib import Path
 
 from benchmarks.catalogue import Catalogue
@@ -8,17 +9,27 @@ from benchmarks.report.formats import latex, markdown, numbers, page, tables
 from benchmarks.report.plots import plots
 from benchmarks.report.table_layout import Layout, lay_out
 from benchmarks.run.plan import TableFolder
+from extrap_train.errors import InputError
 from extrap_train.store.atomic import write_atomic
 
 __all__ = ["lay_out_results", "numbers", "write_reports"]
 
+LOG = logging.getLogger(__name__)
 FORMATS = ("csv", "md", "latex", "html")
 
 
 def lay_out_results(results: Results, catalogue: Catalogue) -> Layout:
-    """A table's results, arranged, with the published numbers that it names."""
+    """A table's results, arranged, with the published numbers that it names and, where there are
+    results of both, the oracle table beside the one with estimated depth.
+    """
     reported = results.plan.table.reported
-    return lay_out(results, catalogue.content("reported", reported) if reported else None)
+    content = catalogue.content("reported", reported) if reported else None
+    beside = None
+    try:
+        beside = results.counterpart()
+    except InputError as error:
+        LOG.warning("%s (not shown beside)", error)
+    return lay_out(results, content, beside)
 
 
 def write_reports(

@@ -5,7 +5,7 @@ A value is a capture's: its draws and seeds are averaged before, for they do not
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -32,6 +32,8 @@ CELL = ["method", *UNIT, "n_views"]
 """What names a cell."""
 CAPTURE = ["category", "sequence"]
 """What counts as a sample: draws and seeds of one capture do not count."""
+_ORACLE = "_oracle"
+"""Ends the name of a table with the data set's depth, which is otherwise that of another table."""
 MEANS = [
     "method", "draw", "n_views", "metric", "mean", "low", "high", "captures", "cells", "of", "rank",
     "p_best", "behind_best",
@@ -50,6 +52,23 @@ class Results:
     def methods(self) -> dict[str, MethodConfig]:
         """By name, in the table's order."""
         return self.plan.methods
+
+    def counterpart(self) -> "Results | None":
+        """The results in the folder beside, of the same captures and rules, of which one is the
+        oracle table (`NAME_oracle`) and the other has estimated depth; None where there are none.
+
+        Raises InputError where they are damaged.
+        """
+        name, own = self.plan.table.name, self.plan.table
+        other = name.removesuffix(_ORACLE) if name.endswith(_ORACLE) else name + _ORACLE
+        folder = TableFolder(self.folder.path.with_name(other))
+        if not folder.plan.is_file():
+            return None
+        found = read_results(folder)
+        table = found.plan.table
+        same_rules = replace(table.rules, depth=own.rules.depth) == own.rules
+        is_pair = table.rules.is_oracle != own.rules.is_oracle
+        return found if is_pair and same_rules and table.captures == own.captures else None
 
     @cached_property
     def tidy(self) -> pd.DataFrame:

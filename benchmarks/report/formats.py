@@ -19,7 +19,7 @@ from torch import Tensor
 from benchmarks.protocol.array_files import pictures_of, read_limited
 from benchmarks.protocol.prepared_scene import Scene
 from benchmarks.report.aggregate import Results
-from benchmarks.report.table_layout import Entry, Layout, name_of
+from benchmarks.report.table_layout import Entry, Layout, Panel, name_of
 from benchmarks.run.cells import OK, Cell, one_line
 from extrap_train.data.image_files import to_eight_bits
 from extrap_train.errors import InputError
@@ -75,8 +75,11 @@ def _spreadsheet_text(value: object) -> object:
 
 
 def numbers(layout: Layout, width: int) -> str:
-    """The panel over everything in plain columns, in as many blocks as the width needs."""
-    panel = layout.panels[0]
+    """The panels over everything in plain columns, in as many blocks as the width needs."""
+    return "\n\n".join(_numbers(panel, width) for panel in [*layout.panels[:1], *layout.beside])
+
+
+def _numbers(panel: Panel, width: int) -> str:
     columns = [(metric, f"{n} views") for metric, n in panel.columns]
     frame = pd.DataFrame(
         [[_plain(entry) for entry in row.entries] for row in panel.rows],

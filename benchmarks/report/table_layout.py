@@ -88,21 +88,33 @@ class Panel:
 
 
 @dataclass(frozen=True)
+class Inputs:
+    """What every method was given, as its finished cells say: a table of words."""
+
+    headings: list[str]
+    rows: list[tuple[str, list[str]]]
+    """A method's title, and a text for each heading."""
+
+
+@dataclass(frozen=True)
 class Layout:
     """Every panel, the published numbers apart, and the reasons of what is missing."""
 
     title: str
     panels: list[Panel]
     """By draw over everything, then by category."""
+    beside: list[Panel]
+    """The panels over everything of the same captures' oracle table, or of the one that is none."""
     reported: Panel | None
+    inputs: Inputs
     missing: list[str]
     """Empty numbers and the cells that have none, with their reasons."""
     notes: list[str]
 
     def in_order(self) -> list[Panel]:
-        """The panel over everything, the published numbers, and the rest."""
+        """The panel over everything, the one beside it, the published numbers, and the rest."""
         reported = [self.reported] if self.reported else []
-        return [*self.panels[:1], *reported, *self.panels[1:]]
+        return [*self.panels[:1], *self.beside, *reported, *self.panels[1:]]
 
 
 def name_of(metric: str) -> str:
@@ -110,12 +122,36 @@ def name_of(metric: str) -> str:
     return NAMES.get(metric, one_line(metric.replace("_", " ")))
 
 
-def lay_out(results: Results, reported: dict[str, Any] | None) -> Layout:
-    """Arrange a table's results; `reported` is a file of published numbers.
+def lay_out(
+    results: Results, reported: dict[str, Any] | None, beside: Results | None = None
+) -> Layout:
+    """Arrange a table's results; `reported` is a file of published numbers, `beside` the results of
+    the same captures with depth of another kind (`Results.counterpart`).
 
     Every text is on one line; each format escapes what means something in it.
     """
-    name = one_line(results.plan.table.title or results.plan.table.name)
+    name = _title(results)
+    return Layout(
+        title=name,
+        panels=_panels(results, name),
+        beside=_panels(beside, _title(beside))[:1] if beside else [],
+        reported=None if reported is None else _list_reported(reported),
+        inputs=_tabulate_inputs(results),
+        missing=[one_line(line, _MAX_NOTE) for line in _missing(results)],
+        notes=[one_line(line, _MAX_NOTE) for line in _notes(results)],
+    )
+
+
+def _title(results: Results) -> str:
+    table = results.plan.table
+    depth = f"depth estimated from the inputs ({table.rules.depth})"
+    if table.rules.is_oracle:
+        depth = "oracle: depth of the data set"
+    quick = " (quick: a part of the table)" if results.plan.quick else ""
+    return one_line(f"{table.title or table.name}; {depth}{quick}")
+
+
+def _panels(results: Results, name: str) -> list[Panel]:
     panels = []
     categories = list(dict.fromkeys(cell.category for cell in results.cells))
     for category in [None, *(categories if len(categories) > 1 else [])]:
@@ -123,14 +159,7 @@ def lay_out(results: Results, reported: dict[str, Any] | None) -> Layout:
         for draw in dict.fromkeys(cell.draw for cell in results.cells):
             title = one_line(f"{category or name}, {draw} inputs")
             panels.append(_panel(title, results, means[means["draw"] == draw], category, draw))
-    quick = " (quick: a part of the table)" if results.plan.quick else ""
-    return Layout(
-        title=name + quick,
-        panels=panels,
-        reported=None if reported is None else _list_reported(reported),
-        missing=[one_line(line, _MAX_NOTE) for line in _missing(results)],
-        notes=[one_line(line, _MAX_NOTE) for line in _notes(results)],
-    )
+    return panels
 
 
 def _panel(
@@ -234,35 +263,42 @@ def _missing(results: Results) -> list[str]:
 def _notes(results: Results) -> list[str]:
     times = {entry.title: entry.time for entry in results.methods.values()}
     protocol, rules = results.plan.protocol, results.plan.table.rules
-    devices = sorted({cell.device for cell in results.cells})
     return [
         f"Protocol {protocol[:16]}: {rules.pool} frames by farthest-point sampling, "
-        f"{rules.image_size} × {rules.image_size} px, depth of the inputs: {rules.depth}. "
-        f"Device: {', '.join(devices)}.",
+        f"{rules.image_size} × {rules.image_size} px, depth of the inputs: {rules.depth}.",
         "Best bold, second underlined; ° marks what cannot be told from the best (sign-flip test "
         "of the paired differences over captures, p above 5 %; below "
         f"{FEWEST_CAPTURES} captures nothing can). A mean that lacks cells says how many it has of "
         "how many, and is not ranked.",
-        "Time: " + "; ".join(f"{title}: {meaning}" for title, meaning in times.items()) + ".",
-        *input_notes(results),
+        "Time: " + "; ".join(f"{title}: {meaning}" for title, meaning in times.items()) + ". Per "
+        "image, it is generation, alignment where a row aligns its views, and the image's share of "
+        "estimating depth and of adapting.",
     ]
 
 
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
-def input_notes(results: Results) -> list[str]:
-    """One line of what the finished cells say that they were given, or none."""
+def _tabulate_inputs(results: Results) -> Inputs:
+    """What the finished cells say that they were given."""
     used: dict[str, dict[str, Counter[str]]] = {}
     for cell in results.cells:
         if cell.status == OK:
             for name, value in cell.given.items():
                 used.setdefault(cell.method, {}).setdefault(name, Counter())[value] += 1
-    lines = [
-        f"{method} — {', '.join(f'{name}: {_count_values(n)}' for name, n in words.items())}"
+    headings = list(dict.fromkeys(name for words in used.values() for name in words))
+    titles = {method: entry.title or method for method, entry in results.methods.items()}
+    rows = [
+        (
+            one_line(titles[method]),
+            [
+                one_line(_count_values(words[name]), _MAX_NOTE) if name in words else "–"
+                for name in headings
+            ],
+        )
         for method, words in used.items()
     ]
-    return ["Inputs: " + "; ".join(lines) + "."] if lines else []
+    return Inputs([one_line(name) for name in headings], rows)
 
 
 def _count_values(values: Counter[str]) -> str:

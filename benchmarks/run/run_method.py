@@ -102,7 +102,7 @@ def _pack_synthesis(
         "seconds": synthesis.seconds + inputs.depth_source.seconds / sharing,
         "wall_seconds": wall_seconds,
         "peak_memory_mib": peak_memory_mib,
-        "given": dict(synthesis.given),
+        "given": {**synthesis.given, "device": device_used()},
         "counts": dict(synthesis.counts),
     }
     try:
@@ -120,16 +120,22 @@ def _pack(values: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = N
 
 
 def peak_memory_mib() -> float | None:
-    """The most memory that this process has held, of the GPU where it sees one; None where the
+    """The most memory that this process has held, of the GPU where it used one; None where the
     system (no Linux) cannot say.
 
     Each method has a process of its own, which begins with what its server had imported.
     """
-    if torch.cuda.is_available():
+    if device_used() == "cuda":
         return torch.cuda.max_memory_allocated() / 2**20
     if sys.platform != "linux":
         return None
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def device_used() -> str:
+    """Where this process's tensors were: a method that a GPU is lent to may run on the CPU."""
+    used = torch.cuda.is_available() and torch.cuda.max_memory_allocated() > 0
+    return "cuda" if used else "cpu"
 
 
 def _require_floats(values: Any, what: str) -> None:

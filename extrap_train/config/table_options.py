@@ -107,8 +107,15 @@ class RulesConfig:
         [0], "seeds of the draws and of the methods' own randomness", is_set=True, low=0, high=2**30
     )
     depth: str = option(
-        "dataset", "where the inputs' depth comes from: a choice of depth= in the other commands"
+        "stereo",
+        "where the inputs' depth comes from: a choice of depth= in the other commands; dataset "
+        "makes the table an oracle",
     )
+
+    @property
+    def is_oracle(self) -> bool:
+        """Whether methods are told more of a capture than its inputs show."""
+        return self.depth == "dataset"
 
 
 @dataclass

@@ -58,6 +58,7 @@ captures:
   render_size: 24
 rules:
   image_size: 24
+  depth: dataset
   views: [3]
 methods: [dark, light]
 columns: [psnr, masked_psnr, lpips_alex, seconds]

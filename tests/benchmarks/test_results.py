@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks.report.aggregate import UNIT, mean_interval, to_best
 from benchmarks.report.formats import latex, markdown
-from benchmarks.report.table_layout import NAMES, Entry, Layout, Panel, Row, lay_out
+from benchmarks.report.table_layout import NAMES, Entry, Inputs, Layout, Panel, Row, lay_out
 from extrap_train.config import METRICS, metric_direction
 from tests.benchmarks.made import cell, results
 
@@ -119,9 +119,9 @@ def test_memory_and_a_conditional_distance_rank_nobody() -> None:
 
 def test_a_panel_says_over_how_many_captures() -> None:
     few = lay_out(results(*(cell("a", str(i), 0, 30.0 + i) for i in range(4))), None).panels[0]
-    assert few.title == "t, random inputs (4 captures: too few to tell methods apart)"
+    assert few.title.endswith("random inputs (4 captures: too few to tell methods apart)")
     enough = lay_out(results(*(cell("a", str(i), 0, 30.0 + i) for i in range(6))), None).panels[0]
-    assert enough.title == "t, random inputs (6 captures)"
+    assert enough.title.endswith("random inputs (6 captures)")
     spread = "over 6 captures, 6 cells"
     assert enough.rows[0].entries[0].title == f"95 % interval 30.54 to 34.46 {spread}"
     one = lay_out(results(cell("a", "0", 0, 30.0)), None).panels[0]
@@ -134,8 +134,9 @@ def test_what_was_given_is_said_of_everycell() -> None:
         cell("ours", "1", 0, 30.0, depth="used", ended="steps"),
         cell("ours", "2", 0, 30.0, depth="used", ended="steps"),
     )
-    notes = "\n".join(lay_out(table, None).notes)
-    assert "Inputs: ours — depth: used, ended: steps (2 cells) / time (1 cells)." in notes
+    inputs = lay_out(table, None).inputs
+    assert inputs.headings == ["depth", "ended"]
+    assert inputs.rows == [("ours", ["used", "steps (2 cells) / time (1 cells)"])]
 
 
 def test_what_differs_in_its_numbers_only_is_said_once() -> None:
@@ -144,9 +145,8 @@ def test_what_differs_in_its_numbers_only_is_said_once() -> None:
         cell("ours", "1", 0, 30.0, init="120 points of 2 inputs, 0.25 random"),
         cell("ours", "2", 0, 30.0, init="none"),
     )
-    notes = "\n".join(lay_out(table, None).notes)
     ranges = "9 to 120 points of 2 inputs, 0.25 to 0.5 random (2 cells)"
-    assert f"Inputs: ours — init: {ranges} / none (1 cells)." in notes
+    assert lay_out(table, None).inputs.rows == [("ours", [f"{ranges} / none (1 cells)"])]
 
 
 def _layout() -> Layout:
@@ -155,7 +155,8 @@ def _layout() -> Layout:
         Row("C_1", "two", [Entry("29.00", 29.0, 2, ties_best=True), Entry("0.2", 0.2, 1)]),
     ]
     panel = Panel("Everything, random inputs", [("PSNR ↑", 3), ("DISTS ↓", 3)], rows)
-    return Layout("A table", [panel], panel, ["dists: no weights"], ["a note, 95 %"])
+    inputs = Inputs(["device & init"], [("A & B", ["cpu_0"])])
+    return Layout("A table", [panel], [], panel, inputs, ["dists: no weights"], ["a note, 95 %"])
 
 
 def test_markdown_marks_best_second_and_ties() -> None:
@@ -170,5 +171,5 @@ def test_latex_is_escaped_and_marked() -> None:
     text = latex(_layout())
     assert r"A \& B & \textbf{30.00} & -- \\" in text
     assert r"C\_1 & \underline{29.00}$^\circ$ & \textbf{0.2} \\" in text
-    assert text.count(r"\midrule") == 4  # under both heads, and between both groups
+    assert text.count(r"\midrule") == 5  # under three heads, and between both groups twice
     assert text.count("{") == text.count("}")

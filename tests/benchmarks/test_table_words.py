@@ -1,14 +1,19 @@
 """What a table is told: its words, its folders, its methods; one line where they are wrong."""
 
+import shutil
 from pathlib import Path
 
 import pytest
 
 from benchmarks.__main__ import main
 from benchmarks.catalogue import Catalogue
+from benchmarks.report import lay_out_results
 from benchmarks.report.aggregate import read_results
+from benchmarks.run.plan import TableFolder
+from benchmarks.run.run_method import build_method
+from benchmarks.run_table import RunOptions, run_table
 from extrap_train.errors import InputError
-from tests.benchmarks.tables import greys_folder, run_greys, write_own
+from tests.benchmarks.tables import greys_folder, run_greys, without_plots, write_own
 
 
 @pytest.fixture
@@ -74,11 +79,19 @@ def test_a_wrong_word_is_one_line(
 
 
 def test_every_table_of_the_package_is_sound() -> None:
-    """Its methods exist, its columns are metrics, its published numbers are complete."""
+    """Its methods exist, its columns are metrics, its published numbers are complete.
+
+    It shows what needs no training, names first what no input shows, and takes no depth but what
+    the inputs give unless its name says that it is an oracle.
+    """
     catalogue = Catalogue.with_own()
     for name in catalogue.names("table"):
         table = catalogue.table(name)
-        assert table.methods
+        assert table.methods[:2] == ["nearest", "inpainted"]
+        assert table.columns[:2] == ["unseen_psnr", "unseen_ssim"]
+        assert table.rules.is_oracle == name.endswith("_oracle")
+        for method, options in table.options.items():
+            build_method(catalogue.method(method, options))
         catalogue.check(table)
         for method in table.methods:
             assert catalogue.method(method).factory
@@ -89,6 +102,43 @@ def test_every_table_of_the_package_is_sound() -> None:
             content = catalogue.content("reported", table.reported)
             for row in content["rows"].values():
                 assert all(len(v) == len(content["metrics"]) for v in row.values())
+
+
+def test_a_table_extends_another(own: Path) -> None:
+    (own / "table" / "more.yaml").write_text("extends: greys\nrules: {pool: 5}\nmethods: [dark]\n")
+    (own / "table" / "loop.yaml").write_text("extends: loop\n")
+    catalogue = Catalogue.with_own([str(own)])
+    table, base = catalogue.table("more"), catalogue.table("greys")
+    assert (table.name, table.rules.pool, table.methods) == ("more", 5, ["dark"])
+    assert (table.rules.image_size, table.captures) == (base.rules.image_size, base.captures)
+    with pytest.raises(InputError, match="extends itself"):
+        catalogue.table("loop")
+
+
+def test_the_oracle_table_stands_beside_the_one_with_estimated_depth(
+    own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In every format and in the same form, from the moment that there are both results."""
+    (own / "table" / "greys_oracle.yaml").write_text("extends: greys\n")
+    catalogue = Catalogue.with_own([str(own)])
+    small = ["methods=[dark]", f"output={tmp_path}", "rules.pool=4"]
+    for name, depth in (("greys", "stereo"), ("greys_oracle", "dataset")):
+        table = catalogue.table(name, [*small, f"rules.depth={depth}"])
+        with without_plots():
+            assert run_table(table, catalogue, RunOptions(quick=True, workers=1)) == 0
+    said = capsys.readouterr().out
+    assert said.count("estimated from the inputs (stereo)") == 2  # of greys, and beside the oracle
+    main(["report", "greys", f"output={tmp_path}", "--config-dir", str(own)])
+    for name in ("greys", "greys_oracle"):
+        for file in (f"{name}.md", f"{name}.tex", "index.html"):
+            text = (tmp_path / name / file).read_text()
+            both = [text.index(w) for w in ("inputs (stereo)", "oracle: depth of the data set")]
+            assert (both[0] < both[1]) == (name == "greys")
+    shutil.rmtree(tmp_path / "greys" / "cells")
+    results = read_results(TableFolder(tmp_path / "greys_oracle"))
+    assert results.counterpart().cells == []
+    (tmp_path / "greys" / "plan.json").write_text("{")
+    assert lay_out_results(results, catalogue).beside == []
 
 
 def test_the_readmes_method_runs_as_it_stands(tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ def test_a_cell_says_what_made_it(finished: Path) -> None:
         assert cell.made_from.options["factory"] == "grey_method.Grey"
         assert cell.made_from.options["rules.image_size"] == 24
         assert set(cell.made_from.inputs) == {"photographs", "weights", "code"}
-        assert cell.given == {"init": "none"}
+        assert cell.given == {"init": "none", "device": "cpu"}
         assert cell.counts == {"greys": 1.0}
         assert cell.made_from.packages["torch"]
     assert len({cell.key for cell in cells}) == len(cells) == 4
@@ -290,7 +290,7 @@ def test_a_cluster_makes_the_same_table(own: Path, finished: Path, tmp_path: Pat
 
 
 def test_a_quick_table_says_that_it_is_one(finished: Path, quick: Path) -> None:
-    title = "Greys (quick: a part of the table)"
+    title = "Greys; oracle: depth of the data set (quick: a part of the table)"
     assert f"<title>{title}" in (quick / "greys" / "index.html").read_text()
     assert title in (quick / "greys" / "greys.md").read_text()
     assert "quick" not in (finished / "greys" / "greys.md").read_text()
