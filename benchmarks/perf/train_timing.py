@@ -12,6 +12,7 @@ from benchmarks.perf.diffusion_case import Run, compare_models
 from benchmarks.perf.timing import Row, devices
 from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.step_noise import StepNoise
 from extrap_train.views import PairBatch
 
 _FORWARD_AND_BACKWARD = 3
@@ -39,9 +40,9 @@ def training_step(model: ExtrapolationModel, batch: PairBatch, *, optimised: boo
     )
 
     def step() -> Float[Tensor, ""]:
-        generator = torch.Generator().manual_seed(0)
+        draws = StepNoise(torch.Generator().manual_seed(0))
         with torch.autocast(device.type, torch.bfloat16, enabled=optimised):
-            loss = diffusion_loss(model, batch, generator, 0.0)
+            loss = diffusion_loss(model, batch, draws, 0.0)
         loss.backward()
         optimizer.step()
         optimizer.zero_grad()

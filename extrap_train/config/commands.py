@@ -71,7 +71,14 @@ class TrainerConfig:
         False,
         "repeat a GPU's training to the bit, where torch can; slower. A CPU always repeats itself",
     )
-    devices: int = option(1, "GPUs, each with its own batch (distributed data parallel)", low=1)
+    devices: int = option(
+        1, "GPUs of a machine, each with its own batch (distributed data parallel)", low=1
+    )
+    num_nodes: int = option(
+        1,
+        "machines that train together, each with its own devices; start with torchrun or srun",
+        low=1,
+    )
     checkpoint_every: int = option(
         200, "steps between checkpoints; a killed run loses at most these", low=1
     )

@@ -20,6 +20,7 @@ from extrap_train.diffusion.conditioning import Conditioning
 from extrap_train.diffusion.loss import Anchor, Unchanged, diffusion_loss, prediction_errors
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sampling_timesteps
+from extrap_train.diffusion.step_noise import StepNoise
 from extrap_train.errors import InputError
 from extrap_train.geometry.warp import compute_warp
 from extrap_train.views import PairBatch, combine
@@ -106,10 +107,10 @@ def adapt(
         rng = np.random.default_rng((seed, step))
         batch = pairs.training_batch(options.batch_size, rng)
         batch = compute_warp(batch.to(fabric.device), model.config.image_size)
-        generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
+        draws = StepNoise(torch.Generator().manual_seed(int(rng.integers(2**31))))
         with fabric.autocast():
             anchor = _anchor(batch, anchored)
-            loss = diffusion_loss(model, batch, generator, dropout, anchor=anchor)
+            loss = diffusion_loss(model, batch, draws, dropout, anchor=anchor)
         optimizer.zero_grad()
         fabric.backward(loss)
         optimizer.step()

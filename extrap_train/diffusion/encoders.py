@@ -14,6 +14,7 @@ from torch.nn import functional
 from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
 from extrap_train.config import ClipConfig, ModelConfig, VaeConfig
+from extrap_train.diffusion.step_noise import StepNoise
 from extrap_train.views import send
 
 LATENT_SCALE = 0.18215
@@ -63,12 +64,12 @@ class PixelPatches:
         self.channels = 3 * patch * patch
 
     def encode(
-        self, image: Float[Tensor, "b 3 h w"], generator: torch.Generator | None = None
+        self, image: Float[Tensor, "b 3 h w"], draws: StepNoise | None = None
     ) -> Float[Tensor, "b c h2 w2"]:
         """Latents, of about unit spread, of images in [0, 1].
 
-        With a (CPU) generator they are drawn from the posterior, where the latent space has one;
-        without, they are its mode.
+        With `draws` they are drawn from the posterior, where the latent space has one; without,
+        they are its mode.
         """
         return functional.pixel_unshuffle((image - 0.5) * self.gain, self.factor)
 
@@ -102,10 +103,10 @@ class KlAutoencoder(Frozen):
         self.factor = 2 ** (levels - 1)
 
     def encode(
-        self, image: Float[Tensor, "b 3 h w"], generator: torch.Generator | None = None
+        self, image: Float[Tensor, "b 3 h w"], draws: StepNoise | None = None
     ) -> Float[Tensor, "b c h2 w2"]:
         """See `PixelPatches.encode`."""
-        return draw_latent(*self.posterior(image), generator)
+        return draw_latent(*self.posterior(image), draws)
 
     def encode_reference(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c h2 w2"]:
         """See `PixelPatches.encode_reference`: the posterior's mode, not scaled, as in zero123."""
@@ -128,12 +129,11 @@ class KlAutoencoder(Frozen):
 def draw_latent(
     mean: Float[Tensor, "b c h w"],
     std: Float[Tensor, "b c h w"],
-    generator: torch.Generator | None,
+    draws: StepNoise | None,
 ) -> Float[Tensor, "b c h w"]:
-    """Scaled latents drawn from a posterior with a (CPU) generator; without, its mode."""
-    if generator is not None:
-        noise = send(torch.randn(mean.shape, generator=generator), mean)
-        mean = mean + std * noise
+    """Scaled latents drawn from a posterior with `draws`; without, its mode."""
+    if draws is not None:
+        mean = mean + std * send(draws.normal(mean.shape), mean)
     return mean * LATENT_SCALE
 
 

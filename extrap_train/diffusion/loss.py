@@ -12,6 +12,7 @@ from torch.nn import functional
 
 from extrap_train.diffusion.conditioning import Conditioning
 from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.step_noise import StepNoise
 from extrap_train.views import PairBatch, send
 
 Unchanged = Callable[[], AbstractContextManager[None]]
@@ -30,7 +31,7 @@ class Anchor:
 def diffusion_loss(
     model: ExtrapolationModel,
     batch: PairBatch,
-    generator: torch.Generator,
+    draws: StepNoise,
     condition_dropout: float,
     min_snr: float | None = None,
     anchor: Anchor | None = None,
@@ -38,16 +39,15 @@ def diffusion_loss(
     """The training step: mean squared error of the prediction, one random noise level per example.
 
     The condition is dropped for a share of the examples, for classifier-free guidance. Every random
-    number comes from the (CPU) generator, so that a step is a function of its seed
-    alone; on its way to a GPU none waits for it. `min_snr` weighs the levels, see `snr_weights`.
+    number comes from `draws`, so that a step is a function of its seed alone; on their way to a GPU
+    nothing waits for them. `min_snr` weighs the levels, see `snr_weights`.
     """
     conditioning = model.condition(batch)
-    target = model.encode_target(batch, conditioning, generator)
-    dropped = torch.rand(len(target), generator=generator) < condition_dropout
-    steps = model.schedule.config["num_train_timesteps"]
-    timestep = torch.randint(0, steps, (len(target),), generator=generator)
-    timestep = send(timestep, target.device)
-    noise = send(torch.randn(target.shape, generator=generator), target)
+    target = model.encode_target(batch, conditioning, draws)
+    dropped = draws.uniform(len(target)) < condition_dropout
+    levels = draws.integers(model.schedule.config["num_train_timesteps"], len(target))
+    timestep = send(levels, target.device)
+    noise = send(draws.normal(target.shape), target)
     conditioning = conditioning.zeroed(send(dropped, target.device))
     errors = prediction_errors(model, target, noise, timestep, conditioning, anchor)
     if min_snr is not None:

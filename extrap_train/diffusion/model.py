@@ -20,6 +20,7 @@ from extrap_train.diffusion.encoders import (
 )
 from extrap_train.diffusion.family import FAMILIES
 from extrap_train.diffusion.pose_encoding import POSE_CHANNELS
+from extrap_train.diffusion.step_noise import StepNoise
 from extrap_train.errors import InputError
 from extrap_train.views import PairBatch
 
@@ -98,16 +99,16 @@ class ExtrapolationModel(nn.Module):
         self,
         batch: PairBatch,
         conditioning: Conditioning,
-        generator: torch.Generator | None = None,
+        draws: StepNoise | None = None,
     ) -> Float[Tensor, "b z h2 w2"]:
         """What is denoised: the target's latent, relative to the condition's base.
 
-        With a generator the latent is drawn from the autoencoder's posterior, where it has one.
+        With `draws` the latent is drawn from the autoencoder's posterior, where it has one.
         """
         if (cached := batch.features) is not None:
-            latent = draw_latent(cached.target_mean, cached.target_std, generator)
+            latent = draw_latent(cached.target_mean, cached.target_std, draws)
         else:
-            latent = self.autoencoder.encode(batch.image, generator)
+            latent = self.autoencoder.encode(batch.image, draws)
         return latent - conditioning.base
 
     def decode_target(

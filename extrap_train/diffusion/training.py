@@ -1,7 +1,6 @@
 """The training loop's mathematics and its optimiser, as a LightningModule."""
 
 import time
-import zlib
 from typing import Any
 
 import lightning
@@ -24,6 +23,7 @@ from extrap_train.diffusion.evaluation import (
 )
 from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.step_noise import noise_of_step
 from extrap_train.errors import InputError
 from extrap_train.metrics import Distance
 from extrap_train.processes import gather_values
@@ -55,12 +55,10 @@ class CategoryTraining(lightning.LightningModule):
         self.validation_seconds = 0.0
 
     def training_step(self, batch: PairBatch, batch_idx: int) -> Tensor:
-        """One step; its noise is a function of seed, step and rank."""
-        generator = step_generator(self.config.seed, self.global_step, self.global_rank)
-        options = self.config.trainer
-        return diffusion_loss(
-            self.model, batch, generator, options.condition_dropout, options.min_snr
-        )
+        """One step; its noise is a function of the seed and the step."""
+        options, world = self.config.trainer, self.trainer.world_size
+        draws = noise_of_step(self.config.seed, self.global_step, self.global_rank, world)
+        return diffusion_loss(self.model, batch, draws, options.condition_dropout, options.min_snr)
 
     def on_train_batch_end(self, outputs: Any, batch: PairBatch, batch_idx: int) -> None:
         """Record the loss now and then, the mean of all processes."""
@@ -138,18 +136,6 @@ class CategoryTraining(lightning.LightningModule):
         )
         rate = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: rate_at(step, trainer))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": rate, "interval": "step"}}
-
-
-def step_generator(seed: int, step: int, rank: int) -> torch.Generator:
-    """The generator of one process's noise at one step.
-
-    torch's CPU generator takes 32 bits of a seed: where there are more (from seed 64 on), all of
-    them are hashed into 32, so that no two steps of a run are the same.
-    """
-    number = (seed * 2**20 + step) * 64 + rank
-    if number >= 2**32:
-        number = zlib.crc32(number.to_bytes(12, "little"))
-    return torch.Generator().manual_seed(number)
 
 
 def rate_at(step: int, options: TrainerConfig) -> float:

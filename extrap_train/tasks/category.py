@@ -259,6 +259,7 @@ def _trainer(
     return quiet_trainer(
         options,
         devices=options.devices,
+        num_nodes=options.num_nodes,
         max_steps=options.steps,
         max_epochs=-1,
         check_val_every_n_epoch=max(1, options.validate_every // kept.every),

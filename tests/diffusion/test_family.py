@@ -12,6 +12,7 @@ from extrap_train.diffusion.family import FAMILIES
 from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sample_views
+from extrap_train.diffusion.step_noise import StepNoise
 from extrap_train.errors import InputError
 from extrap_train.geometry.warp import compute_warp
 from extrap_train.views import PairBatch
@@ -32,7 +33,7 @@ def test_a_published_family_trains_and_samples(
     condition = model.condition(batch)
     assert condition.latents.shape == (3, channels, 16, 16)
     assert not condition.base.any()
-    loss = diffusion_loss(model, batch, torch.Generator().manual_seed(0), 0.1)
+    loss = diffusion_loss(model, batch, StepNoise(torch.Generator().manual_seed(0)), 0.1)
     loss.backward()
     assert loss.isfinite()
     assert model.cc_projection.weight.grad is not None

@@ -11,6 +11,7 @@ from extrap_train.config import ModelConfig
 from extrap_train.diffusion.conditioning import Conditioning
 from extrap_train.diffusion.loss import Anchor, diffusion_loss, prediction_errors, snr_weights
 from extrap_train.diffusion.model import ExtrapolationModel, noise_schedule
+from extrap_train.diffusion.step_noise import StepNoise
 from extrap_train.views import PairBatch
 
 
@@ -58,8 +59,8 @@ def test_a_weighed_model_learns_at_the_noisiest_step(config: ModelConfig, batch:
 def test_weights_change_the_loss_and_not_the_noise(config: ModelConfig, batch: PairBatch) -> None:
     """Under a bound below every level, all errors of the clean sample weigh that bound."""
     model = ExtrapolationModel(replace(config, prediction="sample", zero_terminal_snr=False))
-    plain = diffusion_loss(model, batch, torch.Generator().manual_seed(3), 0.0)
-    weighted = diffusion_loss(model, batch, torch.Generator().manual_seed(3), 0.0, 1e-9)
+    plain = diffusion_loss(model, batch, StepNoise(torch.Generator().manual_seed(3)), 0.0)
+    weighted = diffusion_loss(model, batch, StepNoise(torch.Generator().manual_seed(3)), 0.0, 1e-9)
     assert float(weighted) == pytest.approx(1e-9 * float(plain), rel=1e-4)
 
 
@@ -125,5 +126,7 @@ def test_the_condition_is_dropped_for_the_share_that_is_asked_for(
         return zeroed(self, dropped)
 
     monkeypatch.setattr(Conditioning, "zeroed", record)
-    diffusion_loss(ExtrapolationModel(config), batch, torch.Generator().manual_seed(0), share)
+    diffusion_loss(
+        ExtrapolationModel(config), batch, StepNoise(torch.Generator().manual_seed(0)), share
+    )
     assert [bool(each) for each in seen[0]] == [is_dropped] * len(batch.image)

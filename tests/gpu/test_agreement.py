@@ -21,6 +21,7 @@ from extrap_train.data.frame_files import SealedTable, SequenceFrames, StoredFra
 from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import sample_views
+from extrap_train.diffusion.step_noise import StepNoise
 from extrap_train.geometry.warp import compute_warp, splat_points
 from extrap_train.geometry.warp.surface import normals_from_depth
 from extrap_train.views import PairBatch, stack_cameras
@@ -130,7 +131,9 @@ def test_losses_and_gradients_of_every_family(family: str, gpu: torch.device) ->
     for device in (torch.device("cpu"), gpu):
         model = model.to(device)
         model.zero_grad()
-        loss = diffusion_loss(model, batch.to(device), torch.Generator().manual_seed(0), 0.1)
+        loss = diffusion_loss(
+            model, batch.to(device), StepNoise(torch.Generator().manual_seed(0)), 0.1
+        )
         loss.backward()
         slopes = [x.grad.flatten() for x in model.parameters() if x.grad is not None]
         found.append((loss.detach().cpu(), torch.cat(slopes).cpu()))

@@ -22,6 +22,7 @@ from extrap_train.config import ModelConfig, SamplerConfig, TrainConfig, Trainer
 from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.model_files import initial_model, load_model, save_model
 from extrap_train.diffusion.sampler import sample_views
+from extrap_train.diffusion.step_noise import StepNoise
 from extrap_train.diffusion.training import CategoryTraining
 
 _STEPS = 2
@@ -42,7 +43,7 @@ def _trains(config: ModelConfig, folder: Path, *, mixed: bool) -> None:
     frozen_sums = [_sums(x) for network in frozen for x in network.parameters()]
     for step in range(_STEPS):
         with torch.autocast("cpu", torch.bfloat16, enabled=mixed):
-            loss = diffusion_loss(model, batch, torch.Generator().manual_seed(step), 0.0)
+            loss = diffusion_loss(model, batch, StepNoise(torch.Generator().manual_seed(step)), 0.0)
         loss.backward()
         optimizer.step()
         optimizer.zero_grad()
