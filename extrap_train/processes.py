@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+import torch
 import torch.distributed as dist
 from lightning.pytorch.utilities import rank_zero_only
 
@@ -16,15 +17,9 @@ from extrap_train.store.records import read_record, write_record
 
 T = TypeVar("T")
 
-_LAUNCHES = (
-    "SLURM_JOB_ID",
-    "SLURM_STEP_ID",
-    "SLURM_RESTART_COUNT",
-    "TORCHELASTIC_RUN_ID",
-    "TORCHELASTIC_RESTART_COUNT",
-)
-"""What tells one launch of all processes from another where Lightning does not start them itself.
-Those that it starts find the word of the first, which starts them after it has given it.
+_LAUNCHES = ("SLURM_JOB_ID", "SLURM_STEP_ID", "SLURM_RESTART_COUNT")
+"""What tells one launch of all processes from another under SLURM. Those that Lightning starts find
+the word of the first, which starts them after it has given it; torchrun's meet before (`meet`).
 """
 _WAIT_S = 300.0
 _LOOK_EVERY_S = 0.1
@@ -49,9 +44,21 @@ def is_first() -> bool:
     return cast(Any, rank_zero_only).rank == 0
 
 
+def meet() -> None:
+    """Let the processes of a torchrun meet: by its variables one launch looks like another.
+
+    Lightning takes the group that it finds.
+    """
+    if "TORCHELASTIC_RUN_ID" in os.environ and not dist.is_initialized():
+        dist.init_process_group()
+
+
 def announce(folder: Path, opening: Opening) -> None:
     """Tell the other processes of this launch that the run is open."""
-    write_record(_announcement(folder), opening)
+    if dist.is_initialized():
+        _broadcast(opening)
+    else:
+        write_record(_announcement(folder), opening)
 
 
 def join(folder: Path, wait_s: float = _WAIT_S) -> Opening:
@@ -60,6 +67,8 @@ def join(folder: Path, wait_s: float = _WAIT_S) -> Opening:
     Raises InputError where it has not within `wait_s`.
     """
     ends = time.monotonic() + wait_s
+    if dist.is_initialized():
+        return cast(Opening, _broadcast(None))
     while (opening := _read_announced(folder)) is None:
         if time.monotonic() >= ends:
             raise InputError(
@@ -77,6 +86,13 @@ def gather_values(value: T) -> list[T]:
     values: list[Any] = [None] * dist.get_world_size()
     dist.all_gather_object(values, value)
     return values
+
+
+def _broadcast(value: Opening | None) -> Opening | None:
+    """The first process's value, in all of them."""
+    values = [value]
+    dist.broadcast_object_list(values, device=torch.device("cpu"))
+    return values[0]
 
 
 def _read_announced(folder: Path) -> Opening | None:

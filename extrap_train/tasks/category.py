@@ -39,7 +39,7 @@ from extrap_train.diffusion.model import ExtrapolationModel, use_channels_last
 from extrap_train.diffusion.model_files import initial_model, save_model
 from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.metrics import lpips_or_reason
-from extrap_train.processes import Opening, announce, is_first, join
+from extrap_train.processes import Opening, announce, is_first, join, meet
 from extrap_train.runs import (
     Finished,
     RunFolder,
@@ -111,6 +111,7 @@ def _open_run(
     folder: RunFolder, config: TrainConfig, manifest: Manifest, console: Console
 ) -> Iterator[Opening]:
     """The run, closed to other commands; the first process opens it, the others follow."""
+    meet()
     if not is_first():
         yield join(folder.path)
         return
