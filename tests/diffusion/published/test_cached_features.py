@@ -26,6 +26,7 @@ from extrap_train.diffusion.encoders import Frozen
 from extrap_train.diffusion.frozen_features import frame_encoder
 from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.model import ExtrapolationModel
+from extrap_train.diffusion.step_noise import StepNoise
 from extrap_train.errors import InputError
 from extrap_train.geometry.warp import compute_warp
 from extrap_train.tasks.training_data import cached_encoder
@@ -84,7 +85,7 @@ def test_a_step_on_cached_features_is_the_step_on_the_frames(
     batches = [_batch(data, model, cached=cached) for cached in (False, True)]
     conditions = [model.condition(batch) for batch in batches]
     targets = [
-        model.encode_target(batch, condition, torch.Generator().manual_seed(1))
+        model.encode_target(batch, condition, StepNoise(torch.Generator().manual_seed(1)))
         for batch, condition in zip(batches, conditions, strict=True)
     ]
     half = {"rtol": 2**-10, "atol": 1e-3}
@@ -92,7 +93,9 @@ def test_a_step_on_cached_features_is_the_step_on_the_frames(
     torch.testing.assert_close(conditions[1].embedding, conditions[0].embedding, **half)
     torch.testing.assert_close(targets[1], targets[0], **half)
     losses = [
-        float(diffusion_loss(model, batch, torch.Generator().manual_seed(2), 0.1).detach())
+        float(
+            diffusion_loss(model, batch, StepNoise(torch.Generator().manual_seed(2)), 0.1).detach()
+        )
         for batch in batches
     ]
     assert losses[1] == pytest.approx(losses[0], rel=1e-3)
@@ -106,7 +109,7 @@ def test_a_step_of_zeronvs_asks_no_frozen_network(
     batch = _batch(data, model, cached=True)
     asked: list[object] = []
     monkeypatch.setattr(Frozen, "_at", lambda self, image: asked.append(self))
-    diffusion_loss(model, batch, torch.Generator().manual_seed(2), 0.0)
+    diffusion_loss(model, batch, StepNoise(torch.Generator().manual_seed(2)), 0.0)
     assert not asked
 
 
