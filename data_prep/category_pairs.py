@@ -28,8 +28,10 @@ from extrap_train.config import (
     PrepConfig,
     SyntheticConfig,
     TrainConfig,
+    Uco3dConfig,
     resolve_paths,
 )
+from extrap_train.data import uco3d
 from extrap_train.data.co3d import read_category, require_category
 from extrap_train.data.co3d.annotations import read_sequence_split
 from extrap_train.data.prepared import PreparedData
@@ -104,9 +106,10 @@ def prepare_members(
     InputError where a member is not there, before minutes go into those ahead of it.
     """
     members, data = config.category.members, config.data
-    if isinstance(data, Co3dConfig) and data.root is not None:
+    if isinstance(data, Co3dConfig | Uco3dConfig) and data.root is not None:
+        is_co3d = isinstance(data, Co3dConfig)
         for member in members:
-            require_category(Path(data.root), member)
+            (require_category if is_co3d else uco3d.require_category)(Path(data.root), member)
     for member in members:
         yield prepare_category(
             member,
@@ -154,9 +157,11 @@ def _sequences(
         wanted = {f"{i:04d}" for i in range(data.test_sequences + data.train_sequences)}
         sequences = [s for s in read_category(root, category) if s.name in wanted]
         return sequences, {f"{i:04d}" for i in range(data.test_sequences)}
-    assert isinstance(data, Co3dConfig)
     assert data.root is not None
     root = Path(data.root)
+    if isinstance(data, Uco3dConfig):
+        return uco3d.read_category(root, category), data.test_sequences
+    assert isinstance(data, Co3dConfig)
     sequences = read_category(root, category)
     if data.set_list is None:
         return sequences, data.test_sequences

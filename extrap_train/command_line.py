@@ -21,7 +21,7 @@ from extrap_train.errors import InputError
 
 GROUPS: dict[str, list[type]] = {
     "category": [schema.CategoryConfig],
-    "data": [schema.SyntheticConfig, schema.Co3dConfig],
+    "data": [schema.SyntheticConfig, schema.Co3dConfig, schema.Uco3dConfig],
     "depth": [
         schema.DatasetDepthConfig,
         schema.StereoConfig,

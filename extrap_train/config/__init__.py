@@ -44,6 +44,7 @@ from extrap_train.config.data_sources import (
     PrepConfig,
     StereoConfig,
     SyntheticConfig,
+    Uco3dConfig,
 )
 from extrap_train.config.model_options import (
     FAMILIES,

@@ -9,6 +9,7 @@ from extrap_train.config.data_sources import (
     FilesDepthConfig,
     PrepConfig,
     SyntheticConfig,
+    Uco3dConfig,
 )
 from extrap_train.config.model_options import (
     NEAREST_ALONE,
@@ -30,10 +31,13 @@ def validate(config: TrainConfig | DataPrepConfig) -> None:
     """Check every option and how they go together; raises InputError with option and remedy."""
     check_options(config)
     _check_prep(config.prep)
-    if isinstance(config.data, Co3dConfig) and not config.data.root:
-        raise InputError("data=co3d needs the folder of the download: give data.root=FOLDER")
+    is_download = isinstance(config.data, Co3dConfig | Uco3dConfig)
+    if is_download and not config.data.root:
+        raise InputError(
+            f"data={config.data.name} needs the folder of the download: give data.root=FOLDER"
+        )
     root = config.data.root
-    if root and isinstance(config.data, Co3dConfig) and not Path(root).is_dir():
+    if root and is_download and not Path(root).is_dir():
         # Before anything is written: a wrong root must not leave a run behind.
         raise InputError(f"data.root={root}: no such folder; give the folder of the download")
     _check_files(config)

@@ -59,6 +59,19 @@ class Co3dConfig(DataConfig):
 
 
 @dataclass
+class Uco3dConfig(DataConfig):
+    """A uCO3D download."""
+
+    name: str = "uco3d"
+    test_sequences: int = option(
+        5,
+        "test sequences, drawn by a hash of their names; a lone sequence holds out frames instead",
+        low=1,
+        high=10_000,
+    )
+
+
+@dataclass
 class PrepConfig:
     """Which sequences and pairs become training data (paper III-A.1)."""
 

@@ -34,8 +34,8 @@ class SceneOptions:
 
     scene: str | None = option(
         None,
-        "co3d:ROOT/category/sequence, synthetic:category/0003, a folder with transforms.json or "
-        "a COLMAP model, or a folder of photographs alone",
+        "co3d:ROOT/category/sequence, uco3d:ROOT/…/sequence, synthetic:category/0003, a "
+        "folder with transforms.json or a COLMAP model, or a folder of photographs alone",
     )
     inputs: int | None = option(
         None,

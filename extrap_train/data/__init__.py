@@ -6,10 +6,10 @@ before anything of that size is allocated, and what cannot be used raises `Input
 | step | modules |
 |---|---|
 | a capture by what a person typed | `scene_spec` |
-| its description, in each format | `co3d`, `transforms_json` (`lens_keys`), `colmap`, `synthetic` |
+| its description | `co3d`, `uco3d`, `transforms_json` (`lens_keys`), `colmap`, `synthetic` |
 | photographs that come without one | `estimated_poses` (`structure_from_motion`) |
 | from descriptions to frames not yet read | `listed_photographs`, `listed_files`, `sequences` |
-| files to pixels | `image_files`, `depth_files` |
+| files to pixels | `image_files`, `video_files`, `depth_files` |
 | whether paths, JSON and cameras are sound | `paths`, `json_files`, `camera_check` |
 | photographs to squares with depth | `square_frames` |
 | squares on disk and back | `frame_files` (`frame_codec`), `prepared` |

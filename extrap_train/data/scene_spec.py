@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from extrap_train.config import SyntheticConfig
+from extrap_train.data import uco3d
 from extrap_train.data.camera_check import CO3D_POSES, find_pose_fault
 from extrap_train.data.co3d import FRAME_ANNOTATIONS, read_sequence
 from extrap_train.data.colmap import find_model, read_model
@@ -14,9 +15,11 @@ from extrap_train.errors import InputError
 from extrap_train.views import stack_poses
 
 CO3D_SCHEME = "co3d:"
+UCO3D_SCHEME = "uco3d:"
 SYNTHETIC_SCHEME = "synthetic:"
 KNOWN_FORMS = (
-    "co3d:ROOT/category/sequence, a folder with a transforms.json, a folder with a COLMAP model "
+    "co3d:ROOT/category/sequence, uco3d:ROOT/supercategory/category/sequence, a folder with a "
+    "transforms.json, a folder with a COLMAP model "
     "(sparse/0 beside images), a folder of photographs, or synthetic:category/0003"
 )
 
@@ -37,6 +40,8 @@ def open_scene(spec: str, synthetic: SyntheticConfig | None = None) -> FrameSequ
         return _open_synthetic(spec, synthetic or SyntheticConfig())
     if spec.startswith(CO3D_SCHEME):
         return _open_co3d(spec)
+    if spec.startswith(UCO3D_SCHEME):
+        return _open_uco3d(spec)
     folder = _expand_home(spec)
     if not folder.is_dir():
         raise InputError(f"scene {spec!r}: no such folder; give {KNOWN_FORMS}")
@@ -73,7 +78,7 @@ def scene_address(spec: str) -> str:
     """What `spec` names as it is named from any folder: paths are absolute, through no links."""
     if spec.startswith(SYNTHETIC_SCHEME):
         return spec
-    scheme = CO3D_SCHEME if spec.startswith(CO3D_SCHEME) else ""
+    scheme = next((s for s in (CO3D_SCHEME, UCO3D_SCHEME) if spec.startswith(s)), "")
     return f"{scheme}{_expand_home(spec.removeprefix(scheme)).resolve()}"
 
 
@@ -89,7 +94,21 @@ def _open_co3d(spec: str) -> FrameSequence:
     path = _expand_home(spec.removeprefix(CO3D_SCHEME))
     if len(path.parts) < 3:
         raise InputError(f"scene {spec!r}: is not co3d:ROOT/category/sequence; give all three")
-    sequence = read_sequence(path.parent.parent, path.parent.name, path.name)
+    return _with_sound_poses(read_sequence(path.parent.parent, path.parent.name, path.name), spec)
+
+
+def _open_uco3d(spec: str) -> FrameSequence:
+    path = _expand_home(spec.removeprefix(UCO3D_SCHEME))
+    root = next((above for above in path.parents if (above / uco3d.METADATA).is_file()), None)
+    if root is None:
+        raise InputError(
+            f"scene {spec!r}: no {uco3d.METADATA} in a folder above; give uco3d:ROOT/supercategory/"
+            "category/sequence"
+        )
+    return _with_sound_poses(uco3d.read_sequence(root, path.name), spec)
+
+
+def _with_sound_poses(sequence: FrameSequence, spec: str) -> FrameSequence:
     cameras = stack_poses([frame.camera for frame in sequence.frames])
     if fault := find_pose_fault(cameras, CO3D_POSES):
         raise InputError(f"scene {spec!r}: {fault}")
