@@ -24,24 +24,24 @@ from extrap_train.views import Camera, View, Warp, stack_cameras
 
 CORRECTION_VERSION = 3
 """Raised whenever the same frames give other corrections, so that old ones are made anew."""
-LEAST_MATCHES = 40
+MIN_MATCHES = 40
 """Fewer do not tell a smooth motion from chance."""
 LARGEST_ACROSS = 0.006
 """Median distance of the matches from their points' epipolar lines, as a share of the picture's
 longer side (0.75 px of 128). Correct depths give 0, real poses and matchers about half of this
 limit, chance at least twice of it (docs/preparation.md)."""
-LEAST_INLIERS = 0.5
+MIN_INLIERS = 0.5
 """Share of the matches that a smooth motion must explain."""
-LEAST_STEP = 0.1
+MIN_STEP = 0.1
 """Pixels that the matches must move by, in the median: a matcher knows no less, and exact depths
 are not to be moved."""
-LEAST_GAIN = 0.01
+MIN_GAIN = 0.01
 """Share of the photometric error that a correction must take away: less is within what resampling
 does to a warp. Says nothing of chance, which takes away as much."""
 STIFFER = (1e-4, 1e-3)
 """Also tried instead of `spline_flow.STIFFNESS`: noise in the depths shakes a field that bends
 easily."""
-MOST_MATCHES = 2000
+MAX_MATCHES = 2000
 """A smooth field needs no more."""
 
 
@@ -73,9 +73,9 @@ def correct_pair(reference: View, query: View, matcher: Matcher, grid: int) -> C
         return Correction(None, as_it_is, as_it_is, reason)
 
     matches = matcher.match(before.image[0], query.image, before.mask[0] > 0)
-    if len(matches) < LEAST_MATCHES:
+    if len(matches) < MIN_MATCHES:
         return leave(f"only {len(matches)} matches")
-    chosen = torch.linspace(0, len(matches) - 1, min(len(matches), MOST_MATCHES)).long()
+    chosen = torch.linspace(0, len(matches) - 1, min(len(matches), MAX_MATCHES)).long()
     matches = matches[chosen]
     steps = matches.first_to_second
     across = float(steps_across(matches.first, steps, reference.camera, camera).median())
@@ -85,17 +85,17 @@ def correct_pair(reference: View, query: View, matcher: Matcher, grid: int) -> C
     positions, steps = matches.first / size * 2 - 1, steps / size * 2
     flow, inliers = fit_flow(positions, steps, matches.confidence, grid)
     share = float(inliers.float().mean())
-    if share < LEAST_INLIERS:
+    if share < MIN_INLIERS:
         return leave(f"{share:.0%} of the matches move together")
     positions, steps, weights = positions[inliers], steps[inliers], matches.confidence[inliers]
     left = (steps - flow_at(flow, positions)).norm(dim=1).median()
     if not left < steps.norm(dim=1).median():  # no nearer to where they belong than before
         return leave("the matches have no motion in common")
-    if float((steps * size / 2).norm(dim=1).median()) < LEAST_STEP:
+    if float((steps * size / 2).norm(dim=1).median()) < MIN_STEP:
         return leave("the matches hardly move")
     flows = [flow, *(least_squares_flow(positions, steps, weights, grid, s) for s in STIFFER)]
     best = max((_try_flow(before, reference, query, flow) for flow in flows), key=_gain)
-    return best if _gain(best) >= LEAST_GAIN else leave("the picture comes no closer")
+    return best if _gain(best) >= MIN_GAIN else leave("the picture comes no closer")
 
 
 def _try_flow(

@@ -21,7 +21,7 @@ from extrap_train.errors import InputError
 from extrap_train.store.atomic import atomic_file, partial_path, replace_synced, write_atomic
 
 _HOLE_COLOUR = (1.0, 0.0, 1.0)
-_LEAST_TILE_PIXELS = 128
+_MIN_TILE_PIXELS = 128
 _FONT_PIXELS = 10
 _FRAMES_PER_SECOND = 12
 _PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
@@ -68,7 +68,7 @@ def draw_contact_sheet(
     titles = list(columns)
     pictures = [columns[title].detach().float().cpu().clamp(0, 1) for title in titles]
     rows, height, width = len(pictures[0]), *pictures[0].shape[-2:]
-    scale = max(1, round(_LEAST_TILE_PIXELS / width))
+    scale = max(1, round(_MIN_TILE_PIXELS / width))
     tile_height, tile_width = height * scale, width * scale
     strip, gap = 20, 4
     above = 16 if captions else 0
@@ -171,7 +171,7 @@ def write_film(images: Float[Tensor, "n 3 h w"], path: Path) -> None:
 
 def _enlarge(pixels: np.ndarray) -> np.ndarray:
     """Enlarged by a whole number to at least a tile's size, with even sides, as video needs."""
-    scale = max(1, round(_LEAST_TILE_PIXELS / pixels.shape[2]))
+    scale = max(1, round(_MIN_TILE_PIXELS / pixels.shape[2]))
     large = pixels.repeat(scale, 1).repeat(scale, 2)
     return np.ascontiguousarray(large[:, : large.shape[1] // 2 * 2, : large.shape[2] // 2 * 2])
 

@@ -26,7 +26,7 @@ _FORKED = (
     "benchmarks.methods.dngaussian",
 )
 """What jobs import that run in processes of their own."""
-_MOST_WORKERS = 8  # each holds about 2 GiB
+_MAX_WORKERS = 8  # each holds about 2 GiB
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
@@ -40,7 +40,7 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     if files or option.markexpr in ("slow", "gpu") or option.capture == "no":
         return 0
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return min(cores or 1, _MOST_WORKERS)
+    return min(cores or 1, _MAX_WORKERS)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

@@ -22,7 +22,7 @@ TSED_FRAME = 256
 _EDGE_THRESHOLD = 30.0
 """COLMAP's, as published; OpenCV divides nothing by it."""
 _RATIO = 0.8
-LEAST_SHARED = 0.1
+MIN_SHARED = 0.1
 """A pair of views says something where at least this share of a view is seen by both."""
 
 
@@ -112,6 +112,6 @@ def _warp_psnr(
     true = depths[target]
     same = (warp.depth[0] - true).abs() < 0.02 * true
     mask = (warp.mask[0] * same).to(images.dtype)
-    if float(mask.mean()) < LEAST_SHARED:
+    if float(mask.mean()) < MIN_SHARED:
         return None
     return float(psnr(warp.image, images[target][None], mask[None]))

@@ -31,12 +31,12 @@ PARALLEL_RAD = np.deg2rad(15)
 """Cameras whose axes differ by less from their mean look the same way, and need no common point."""
 WIDE_RAD = np.deg2rad(20)
 """Axes that differ by more prove that cameras stand around what they look at."""
-LEAST_APART = 1e-4
+MIN_APART = 1e-4
 """Least distance between cameras, as a share of their distance from the origin: below it single
 precision blurs their places."""
 ONE_PLACE = 1e-6
 """In scene units."""
-LEAST_SHARE, NEARLY_ALL = 1 / 3, 0.9
+MIN_SHARE, NEARLY_ALL = 1 / 3, 0.9
 """Shares of cameras that look at one point: too few below the first, enough from the second on to
 name a convention."""
 CLEARLY_RAD = np.deg2rad(5)
@@ -164,7 +164,7 @@ def find_pose_fault(cameras: Camera, convention: PoseConvention) -> str:
             "offset taken off"
         )
     share = float((_angles_to_center_rad(cameras) < LOOKS_AT_RAD).mean())
-    if mistake or (share < LEAST_SHARE and not _look_the_same_way(cameras, PARALLEL_RAD)):
+    if mistake or (share < MIN_SHARE and not _look_the_same_way(cameras, PARALLEL_RAD)):
         return (
             f"its cameras look at nothing in common ({share:.0%} of them look at where their axes "
             f"meet); {belong}"
@@ -198,7 +198,7 @@ def _extent(cameras: Camera) -> tuple[float, float]:
 
 def _stand_apart(cameras: Camera) -> bool:
     apart, away = _extent(cameras)
-    return apart > max(LEAST_APART * away, ONE_PLACE)
+    return apart > max(MIN_APART * away, ONE_PLACE)
 
 
 def _angles_to_center_rad(cameras: Camera) -> Float[np.ndarray, " n"]:

@@ -27,9 +27,9 @@ from extrap_train.data.listed_files import PICTURE_SUFFIXES, is_mask_name
 from extrap_train.data.paths import require_file
 from extrap_train.data.sequences import FrameSequence
 from extrap_train.data.structure_from_motion import (
-    LEAST_PICTURES,
     MAX_FEATURES,
     MAX_SIDE,
+    MIN_PICTURES,
     SEED,
     SharedCamera,
     count_steps,
@@ -40,9 +40,9 @@ from extrap_train.store.atomic import atomic_folder, remove_leftovers
 from extrap_train.store.digests import cache_folder, file_digest, folder_digest
 from extrap_train.terminal import progress
 
-MOST_PICTURES = 1000
+MAX_PICTURES = 1000
 _SUFFIXES = (*PICTURE_SUFFIXES, ".heic", ".heif")
-_MOST_NAMED = 8
+_MAX_NAMED = 8
 _SEAL = "sparse.sha256"
 _REMEDY = (
     "take more pictures of the textured scene in small steps around it, or give a transforms.json "
@@ -68,10 +68,10 @@ def read_unposed(folder: Path, pictures: Sequence[str], name: str) -> FrameSeque
     Pictures that cannot be read or placed are left out with one warning. InputError where fewer
     than three are left, or where pycolmap is needed and missing.
     """
-    if len(pictures) > MOST_PICTURES:
+    if len(pictures) > MAX_PICTURES:
         raise InputError(
             f"{folder}: has {len(pictures)} photographs without cameras, and those of at most "
-            f"{MOST_PICTURES} are estimated; choose some, or run COLMAP yourself"
+            f"{MAX_PICTURES} are estimated; choose some, or run COLMAP yourself"
         )
     pictures = _select_present(folder, pictures)
     settings = {"max_side": MAX_SIDE, "max_features": MAX_FEATURES, "seed": SEED}
@@ -95,13 +95,13 @@ def read_unposed(folder: Path, pictures: Sequence[str], name: str) -> FrameSeque
     placed = {frame.name for frame in sequence.frames}
     lost = [picture for picture in pictures if picture not in placed]
     if lost:
-        more = f" and {len(lost) - _MOST_NAMED} more" if len(lost) > _MOST_NAMED else ""
+        more = f" and {len(lost) - _MAX_NAMED} more" if len(lost) > _MAX_NAMED else ""
         log.warning(
             "%s: %d of %d photographs could not be placed among the others and are left out: %s%s",
             folder,
             len(lost),
             len(pictures),
-            ", ".join(lost[:_MOST_NAMED]),
+            ", ".join(lost[:_MAX_NAMED]),
             more,
         )
     reasons = tuple(f"{folder / picture}: could not be placed among the others" for picture in lost)
@@ -143,10 +143,10 @@ def _estimate(folder: Path, pictures: Sequence[str], made: Path) -> None:
     work.mkdir()
     cameras = _write_grey(folder, pictures, work)
     count = sum(len(camera.files) for camera in cameras)
-    if count < LEAST_PICTURES:
+    if count < MIN_PICTURES:
         raise InputError(
             f"{folder}: has {count} readable photographs and no cameras, which takes at least "
-            f"{LEAST_PICTURES} to estimate; add photographs, or a transforms.json or COLMAP model"
+            f"{MIN_PICTURES} to estimate; add photographs, or a transforms.json or COLMAP model"
         )
     write_job(cameras, work)
     _run(work, count)

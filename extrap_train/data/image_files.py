@@ -36,7 +36,7 @@ DECODER_ERRORS = (
 """What Pillow's decoders raise on damaged files."""
 BACKGROUND = 255
 """What a photograph shows where it is transparent: white, whatever colour is hidden there."""
-_LEAST_PURE = 0.9
+_MIN_PURE = 0.9
 """Share of pure black and white in what a transparent picture shows that makes it a mask."""
 _EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr")
 _ORIENTATION_TAG, _EXIF_TAG, _FOCAL_LENGTH_35MM_TAG = 0x0112, 0x8769, 0xA405
@@ -51,7 +51,7 @@ _TURN_BACK = {
     8: Image.Transpose.ROTATE_270,
 }
 """From the upright picture to the stored one, by the EXIF orientation of the latter."""
-_MOST_ROUNDING = 0.05
+_MAX_ROUNDING = 0.05
 """Two shapes that differ by more are never taken for one, however few pixels they have."""
 _HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 
@@ -101,7 +101,7 @@ def read_mask(path: Path, size: tuple[int, int]) -> Float[Tensor, "h w"]:
     if picture.has_transparency_data:
         alpha = np.array(picture.convert("RGBA").getchannel("A"))
         shown = pixels[alpha > 0]
-        is_mask = np.isin(shown, (0, 1, 255)).sum() >= _LEAST_PURE * shown.size
+        is_mask = np.isin(shown, (0, 1, 255)).sum() >= _MIN_PURE * shown.size
         is_cut_out = alpha.min() < 255 and not is_mask
         pixels = alpha if is_cut_out else np.array(_on_ground(picture, 0).convert("L"))
     pixels = nearest_pixels(pixels, size)
@@ -238,7 +238,7 @@ def same_view(size: tuple[int, int], other: tuple[int, int]) -> bool:
     """Whether two sizes have one shape, up to a pixel of rounding in the smaller of them."""
     (height, width), (large_height, large_width) = sorted((size, other))
     scales = height / large_height, width / large_width
-    rounding = min(1 / large_height + 1 / large_width, _MOST_ROUNDING * max(scales))
+    rounding = min(1 / large_height + 1 / large_width, _MAX_ROUNDING * max(scales))
     return scales[1] <= 1 and abs(scales[0] - scales[1]) <= rounding
 
 

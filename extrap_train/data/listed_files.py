@@ -14,7 +14,7 @@ from extrap_train.errors import InputError
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 """Tried, in this order, where a name has none."""
-_MOST_COMPARED = 2000
+_MAX_COMPARED = 2000
 """Names of a folder that a missing one is compared with."""
 _IMAGES = re.compile(r"images(_\d+)?")
 """Folders of pictures, whole or reduced, that masks lie beside."""
@@ -190,7 +190,7 @@ def _is_file(path: Path) -> bool:
 
 def _look_alike(name: str, names: Iterable[Sequence[str]]) -> str | None:
     """A name of the same stem, else one that differs in little."""
-    few = [other for alike in islice(names, _MOST_COMPARED) for other in alike]
+    few = [other for alike in islice(names, _MAX_COMPARED) for other in alike]
     stem = posixpath.splitext(name)[0].casefold()
     same = [other for other in few if posixpath.splitext(other)[0].casefold() == stem]
     near = same or difflib.get_close_matches(name, few, n=1, cutoff=0.8)

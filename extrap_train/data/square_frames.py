@@ -24,11 +24,11 @@ from extrap_train.views import View, stack_cameras, stack_poses
 
 HELD_OUT_EVERY = 5
 """A lone sequence holds out every fifth frame."""
-LEAST_KNOWN_SHARE = 0.25
+MIN_KNOWN_SHARE = 0.25
 """Least share of known depths under a pixel of the coarser map for it to have one."""
-MOST_UNUSABLE_SHARE = 0.1
+MAX_UNUSABLE_SHARE = 0.1
 """Share of unusable frames beyond which the whole sequence is not trusted."""
-LEAST_FRAMES = 2
+MIN_FRAMES = 2
 """While so many are left, one unusable frame alone does not discredit a sequence."""
 FRAMES_VERSION = 4
 """Raised whenever the same photographs give other frames."""
@@ -205,7 +205,7 @@ def require_few_unusable(reasons: Sequence[str], sequence: FrameSequence, where:
 def too_many_unusable(reasons: Sequence[str], sequence: FrameSequence) -> str:
     """Why a sequence is not trusted with these unusable frames, one reason each; empty if it is."""
     count = len(sequence.frames) + len(sequence.left_out)
-    allowed = max(MOST_UNUSABLE_SHARE * count, 1 if count > LEAST_FRAMES else 0)
+    allowed = max(MAX_UNUSABLE_SHARE * count, 1 if count > MIN_FRAMES else 0)
     if len(reasons) <= allowed:
         return ""
     return f"{len(reasons)} of {count} frames cannot be used, the first because of {reasons[0]}"
@@ -243,7 +243,7 @@ def block_median(depth: Float[Tensor, "h w"], side: int) -> Float[Tensor, "h2 w2
     blocks = depth.float().view(rows, side, columns, side).transpose(1, 2).flatten(2)
     known = blocks.isfinite() & (blocks > 0)
     median = torch.where(known, blocks, torch.nan).nanmedian(-1).values
-    return torch.where(known.float().mean(-1) >= LEAST_KNOWN_SHARE, median, 0)
+    return torch.where(known.float().mean(-1) >= MIN_KNOWN_SHARE, median, 0)
 
 
 def _unit(pixels: UInt8[np.ndarray, "..."]) -> Float[Tensor, "..."]:

@@ -29,7 +29,7 @@ CLEARLY_BETTER = 0.992
 """Distortion, and a principal point off the middle, must each lower the mean reprojection error to
 this share: few pictures hardly tell them from a turn of the cameras."""
 SEED = 0
-LEAST_PICTURES = 3
+MIN_PICTURES = 3
 JOB = "job.json"
 
 
@@ -82,7 +82,7 @@ def main() -> None:
         _find_features(database, folder, camera, number, threads)
     _match(database, folder, sorted(file for c in cameras for file in c.files), threads)
     options = pycolmap.IncrementalPipelineOptions(
-        num_threads=threads, random_seed=SEED, extract_colors=False, min_model_size=LEAST_PICTURES
+        num_threads=threads, random_seed=SEED, extract_colors=False, min_model_size=MIN_PICTURES
     )
     output = folder / "sparse"
     output.mkdir()

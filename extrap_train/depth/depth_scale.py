@@ -21,14 +21,14 @@ from extrap_train.geometry.resample import sample_surfaces
 from extrap_train.views import View
 
 NEIGHBOURS = 4
-MOST_VIEWS = 12
+MAX_VIEWS = 12
 """That one common scale is found from, spread over all."""
 SEARCHES = ((128, 0.03, 0), (256, 0.006, 6), (256, 0.0012, 6))
 """Longer side in pixels, step between the logarithms of scales, and steps to either side of the
 scale that the search before has found; the first search is over all possible scales."""
 TELLING = 1.5
 """A scale that is wrong by this factor must fit worse, ..."""
-LEAST_RISE = 0.02
+MIN_RISE = 0.02
 """... by so much of the cost, 0 to 1, or the views do not tell the scale."""
 
 
@@ -43,7 +43,7 @@ def solve_scales(views: Sequence[View], *, per_view: bool) -> list[float | None]
     scales: list[float | None] = [None] * len(views)
     for group in groups:
         able = [i for i in group if helpers[i]]
-        some = able[:: math.ceil(len(able) / MOST_VIEWS)] if able else []
+        some = able[:: math.ceil(len(able) / MAX_VIEWS)] if able else []
         found = _solve_group(views, some, helpers)
         for i in group:
             scales[i] = found
@@ -66,7 +66,7 @@ def _solve_group(
         found = float(candidates[int(costs.argmin())])
     apart = torch.tensor([found - math.log(TELLING), found, found + math.log(TELLING)])
     below, right, above = _costs(views, group, helpers, apart, SEARCHES[0][0]).tolist()
-    return math.exp(found) if min(below, above) > right + LEAST_RISE else None
+    return math.exp(found) if min(below, above) > right + MIN_RISE else None
 
 
 def _costs(

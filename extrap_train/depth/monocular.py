@@ -19,11 +19,11 @@ from extrap_train.matching import Matcher
 from extrap_train.views import View, combine
 
 LOG = logging.getLogger(__name__)
-LEAST_PARALLAX_RAD = 0.02
+MIN_PARALLAX_RAD = 0.02
 """About 1°: below it a match says little of depth."""
 LARGEST_ERROR = 0.003
 """From the epipolar line, as a share of the picture's longer side; at least a pixel."""
-LEAST_POINTS = 20
+MIN_POINTS = 20
 EXPLAINED = 0.05
 """Relative error of depth up to which a triangulated point agrees."""
 FARTHEST = 3.0
@@ -112,10 +112,10 @@ class MonocularDepth:
         name = view.name or "a view"
         parts = [self._points(view, helper) for helper in helpers]
         count = sum(len(part.depth) for part in parts)
-        if count < LEAST_POINTS:
+        if count < MIN_POINTS:
             raise NotAligned(
                 f"{name}: {count} of its points are found in other views, fewer than the "
-                f"{LEAST_POINTS} that its scale and shift need; add photographs "
+                f"{MIN_POINTS} that its scale and shift need; add photographs "
                 "or choose another depth.matcher"
             )
         points = combine(parts, torch.cat)
@@ -150,7 +150,7 @@ class MonocularDepth:
         found = triangulate(matches.first, matches.second, view.camera, helper.camera)
         largest = max(1.0, LARGEST_ERROR * max(view.image.shape[1:]))
         good = (found.depth > 0) & (found.error <= largest)
-        good &= found.parallax_rad >= LEAST_PARALLAX_RAD
+        good &= found.parallax_rad >= MIN_PARALLAX_RAD
         # The error of an inverse depth is the pixel's over the parallax.
         weights = matches.confidence * found.parallax_rad.square()
         return _Points(matches.first[good], found.depth[good], weights[good])

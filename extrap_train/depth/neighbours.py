@@ -14,7 +14,7 @@ from extrap_train.views import Camera, View, stack_poses
 
 NEAREST_RAD, FARTHEST_RAD = math.radians(6), math.radians(18)
 """Seen from the scene's centre: nearer and depth is vague, farther and surfaces look different."""
-LEAST_RAD, LIMIT_RAD = math.radians(3), math.radians(45)
+MIN_RAD, LIMIT_RAD = math.radians(3), math.radians(45)
 """Outside, views never help in stereo: those of the same place agree at any depth."""
 ROUNDING = 2e-6
 """Distance, as a share of the cameras' distance from the origin, that rounding alone puts between
@@ -90,7 +90,7 @@ def _angles_rad(offsets: Float[Tensor, "n 3"]) -> Float[Tensor, "n n"]:
 def _badness(angle_rad: Float[Tensor, "n n"], limit_rad: float) -> Float[Tensor, "n n"]:
     """How far an angle is from the useful range, then from its middle; infinite if useless."""
     outside = (NEAREST_RAD - angle_rad).clamp_min(0) + (angle_rad - FARTHEST_RAD).clamp_min(0)
-    useful = (angle_rad >= LEAST_RAD) & (angle_rad <= limit_rad)
+    useful = (angle_rad >= MIN_RAD) & (angle_rad <= limit_rad)
     middle = (angle_rad - (NEAREST_RAD + FARTHEST_RAD) / 2).abs()
     return torch.where(useful, 10 * outside + middle, torch.inf)
 
@@ -113,11 +113,11 @@ NEAREST, FARTHEST = 0.3, 20.0
 """Range of depths, as multiples of the scene centre's depth."""
 WIDEST_DISPARITY = 0.25
 """Largest displacement between cameras that look the same way, as a share of the longer side."""
-LEAST_BASELINE = 1e-6
+MIN_BASELINE = 1e-6
 """In scene units: cameras that are nearer to each other stand in one place."""
-LEAST_SEEN = 0.1
+MIN_SEEN = 0.1
 """A depth is not tried if a smaller share of the pixels is then seen by any neighbour."""
-LEAST_CONVERGENCE_RAD = 0.05
+MIN_CONVERGENCE_RAD = 0.05
 """Optical axes that differ by less have no nearest point worth the name."""
 
 
@@ -125,7 +125,7 @@ def convergence_point(cameras: list[Camera]) -> Float[Tensor, "3"] | None:
     """`scene_center` of cameras whose optical axes meet; None if they are nearly parallel."""
     poses = stack_poses(cameras)
     axes = poses.forward.double()
-    if float(torch.acos((axes @ axes.mT).clamp(-1, 1)).max()) < LEAST_CONVERGENCE_RAD:
+    if float(torch.acos((axes @ axes.mT).clamp(-1, 1)).max()) < MIN_CONVERGENCE_RAD:
         return None
     return torch.from_numpy(scene_center(poses)).to(poses.world_to_cam)
 
@@ -147,7 +147,7 @@ def inverse_depth_range(
     else:
         baseline = max(float((other.center - camera.center).norm()) for other in neighbours)
         longer = max(camera.height, camera.width)
-        pixels_at_one = float(camera.intrinsics[0, 0]) * max(baseline, LEAST_BASELINE)
+        pixels_at_one = float(camera.intrinsics[0, 0]) * max(baseline, MIN_BASELINE)
         greatest = WIDEST_DISPARITY * longer / pixels_at_one
         least = greatest / 100
     return _visible_range(camera, neighbours, torch.linspace(least, greatest, 200))
@@ -162,7 +162,7 @@ def _visible_range(
         projection_between(small, other).normalised_points(inverse_depth)[1] for other in neighbours
     ]
     share = torch.stack(seen).any(0).float().mean((-2, -1))
-    used = (share.cpu() >= LEAST_SEEN).nonzero().flatten().tolist()
+    used = (share.cpu() >= MIN_SEEN).nonzero().flatten().tolist()
     if not used:
         return float(candidates[0]), float(candidates[-1])
     if len(used) == 1:  # the true depth lies around it

@@ -13,8 +13,8 @@ from torch.nn import functional
 from extrap_train.config import StereoConfig
 from extrap_train.depth import DepthMap, NoDepthError, PointMaps, point_maps_of
 from extrap_train.depth.neighbours import (
-    LEAST_RAD,
     LIMIT_RAD,
+    MIN_RAD,
     convergence_point,
     inverse_depth_range,
     nearest_angle_rad,
@@ -147,7 +147,7 @@ def _require_helpers(view: View, others: Sequence[View], helpers: list[int]) -> 
 
 def _without_neighbours(alone: Sequence[View], views: Sequence[View]) -> str:
     """One line: which views have no neighbour and so no depth, why, and what helps."""
-    least, most = (round(math.degrees(limit)) for limit in (LEAST_RAD, LIMIT_RAD))
+    least, most = (round(math.degrees(limit)) for limit in (MIN_RAD, LIMIT_RAD))
     nearest = nearest_angle_rad(views)
     if nearest is not None and nearest > LIMIT_RAD:
         why = f"; the nearest two views are {math.degrees(nearest):.0f}° apart"

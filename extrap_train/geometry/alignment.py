@@ -19,13 +19,13 @@ from torch import Tensor
 from extrap_train.geometry.cameras import pixel_grid, transform
 from extrap_train.views import Camera
 
-MOST_PAIRS = 4096
+MAX_PAIRS = 4096
 """Point pairs, spread over the image, that an edge's similarity is fitted to."""
-MOST_RANKED = 1024
+MAX_RANKED = 1024
 """Residuals, spread over the image, that a kernel's width is taken from."""
 SIMILARITY_ROUNDS = 5
 FUSION_ROUNDS = 3
-LEAST_PAIRS = 16
+MIN_PAIRS = 16
 """An edge with fewer usable pairs says nothing."""
 WIDTH = 4.685
 """Width of Tukey's biweight in standard deviations: 95 % efficient on Gaussian noise."""
@@ -38,7 +38,7 @@ _GAUSSIAN_MEDIAN = 0.6745
 _FAR_WORSE = 3.0
 _TIE = 1e-4
 """Relative difference of two distances below which rounding would decide between them."""
-_LEAST_SPREAD = 1e-5
+_MIN_SPREAD = 1e-5
 """Relative residuals below are rounding."""
 
 
@@ -80,7 +80,7 @@ def align_view(camera: Camera, edges: Edges) -> Alignment:
     p. The new depth is a robust mean of log z_e(p) over the edges.
     """
     pairs = _pairs(edges)
-    usable = (pairs.weight > 0).sum(-1) >= LEAST_PAIRS
+    usable = (pairs.weight > 0).sum(-1) >= MIN_PAIRS
     # min Σ w |S_e⁻¹ x_world − x_edge|², by weighted Procrustes.
     edge_to_world, spread = _similarities(pairs)
     usable &= torch.isfinite(edge_to_world).all(-1).all(-1)
@@ -107,7 +107,7 @@ class _Pairs:
 
 def _pairs(edges: Edges) -> _Pairs:
     """An even choice of the known views' points, weighted by what their confidence ranks."""
-    stride = max(1, math.ceil(edges.known_points.shape[1] / MOST_PAIRS))
+    stride = max(1, math.ceil(edges.known_points.shape[1] / MAX_PAIRS))
     edge, world = (
         points[:, ::stride].mT.contiguous() for points in (edges.known_points, edges.world_points)
     )
@@ -137,7 +137,7 @@ def _similarities(pairs: _Pairs) -> tuple[Float[Tensor, "e 4 4"], Float[Tensor, 
         residual = _length(fitted - pairs.edge)
         relative = residual / extent
         median = _strided_median(relative, pairs.weight > 0)
-        sigma = (median / _CHI3_MEDIAN).clamp(min=_LEAST_SPREAD)
+        sigma = (median / _CHI3_MEDIAN).clamp(min=_MIN_SPREAD)
         ratio = relative / sigma[:, None]
         # A convex kernel finds the basin, a redescending one forgets what lies outside of it.
         redescending = step >= SIMILARITY_ROUNDS // 2
@@ -173,7 +173,7 @@ def _trust(spread: Float[Tensor, " e"], usable: Bool[Tensor, " e"]) -> Float[Ten
     A good fit to the known view proves nothing: smooth errors vanish in it and stay in the new one.
     """
     median = _strided_median(spread[None], usable[None])
-    return 1 / (1 + (spread / (_FAR_WORSE * median.clamp(min=_LEAST_SPREAD))).square())
+    return 1 / (1 + (spread / (_FAR_WORSE * median.clamp(min=_MIN_SPREAD))).square())
 
 
 def _extent(pairs: _Pairs) -> Float[Tensor, " e"]:
@@ -215,7 +215,7 @@ def _robust_mean(
         residual = (log - center).abs()
         several = known & (known.sum(0) > 1)
         sigma = _strided_median(residual.flatten()[None], several.flatten()[None])
-        sigma = (sigma / _GAUSSIAN_MEDIAN).clamp(min=_LEAST_SPREAD)
+        sigma = (sigma / _GAUSSIAN_MEDIAN).clamp(min=_MIN_SPREAD)
         robust = _biweight(residual / (WIDTH * sigma)) * known
         total = (reliable * robust).sum(0)
         mean = (reliable * robust * log).sum(0) / total.clamp(min=1e-30)
@@ -244,8 +244,8 @@ def _weighted_median(values: Float[Tensor, "e h w"], weight: Float[Tensor, "e h 
 def _strided_median(values: Float[Tensor, "e n"], mask: Bool[Tensor, "e n"]) -> Float[Tensor, " e"]:
     """The lower median of each row's masked entries; 0 without any.
 
-    Of longer rows every n-th entry is ranked, `MOST_RANKED` to twice as many.
+    Of longer rows every n-th entry is ranked, `MAX_RANKED` to twice as many.
     """
-    stride = max(1, values.shape[1] // MOST_RANKED)
+    stride = max(1, values.shape[1] // MAX_RANKED)
     chosen = torch.where(mask[:, ::stride], values[:, ::stride], torch.nan)
     return chosen.nanmedian(-1).values.nan_to_num()

@@ -14,9 +14,9 @@ WINDOW = 7
 """Side of the windows, in pixels."""
 COLOUR_NOISE = 5e-6
 """Variance of a colour channel (0.6/255 squared) that counts as noise, not as texture."""
-LEAST_TEXTURE = 4e-4
+MIN_TEXTURE = 4e-4
 """Variance of brightness (5/255 squared) below which a window has nothing to compare."""
-LEAST_KNOWN = 0.5
+MIN_KNOWN = 0.5
 """Share of a window that must be known for it to say anything."""
 CONSISTENT_CORRELATION = 0.5
 """From here on two windows show the same."""
@@ -33,7 +33,7 @@ def windowed_correlation(
     window = _moments(first, second, known, border_is_known=True)
     variances = [v.clamp_min(0) + COLOUR_NOISE for v in (window.variance, window.other_variance)]
     correlation = window.covariance / (variances[0] * variances[1]).sqrt()
-    return torch.where(window.known_share >= LEAST_KNOWN, correlation.mean(0).clamp(0, 1), 0)
+    return torch.where(window.known_share >= MIN_KNOWN, correlation.mean(0).clamp(0, 1), 0)
 
 
 def ncc_consistent(
@@ -45,8 +45,8 @@ def ncc_consistent(
         first.mean(0, keepdim=True), second.mean(0, keepdim=True), weight, border_is_known=False
     )
     variances = window.variance[0], window.other_variance[0]
-    comparable = known & (window.known_share > LEAST_KNOWN)
-    comparable &= torch.maximum(*variances) > LEAST_TEXTURE
+    comparable = known & (window.known_share > MIN_KNOWN)
+    comparable &= torch.maximum(*variances) > MIN_TEXTURE
     scale = (variances[0].clamp_min(1e-12) * variances[1].clamp_min(1e-12)).sqrt()
     return (window.covariance[0] / scale > CONSISTENT_CORRELATION) & comparable, comparable
 

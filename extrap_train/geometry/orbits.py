@@ -15,7 +15,7 @@ from extrap_train.geometry.viewpoints import (
 )
 from extrap_train.views import Camera
 
-LEAST_VIEWS = 3
+MIN_VIEWS = 3
 """Fewer do not show which way their orbit leans."""
 
 Angles = Float[np.ndarray, "*n"] | float
@@ -83,8 +83,8 @@ def orbit_cameras(views: Camera, span_rad: float, count: int) -> Camera:
     with the orbit's axis up, and have their median focal length around the image's middle. A full
     turn does not repeat its first camera. Raises ValueError for fewer than three views.
     """
-    if len(views.world_to_cam) < LEAST_VIEWS:
-        raise ValueError(f"an orbit needs {LEAST_VIEWS} views, not {len(views.world_to_cam)}")
+    if len(views.world_to_cam) < MIN_VIEWS:
+        raise ValueError(f"an orbit needs {MIN_VIEWS} views, not {len(views.world_to_cam)}")
     orbit = fit_orbit(views)
     circle = Circle.around(orbit.center, orbit.axis, views)
     _, elevations_rad, distances = circle.locate(camera_centers(views))

@@ -17,7 +17,7 @@ OUTLIER_MADS = 3.0
 """Residuals beyond this many robust standard deviations are not part of a smooth motion."""
 MEDIAN_TO_SIGMA = 1 / 1.1774
 """The median length of a residual in the plane is 1.1774 sigma where its two parts are normal."""
-LEAST_SIGMA = 1e-3
+MIN_SIGMA = 1e-3
 """Normalised; about a tenth of a pixel at 256². Residuals that small are never outliers."""
 ROUNDS = 6
 
@@ -86,11 +86,11 @@ def fit_flow(
     for _ in range(ROUNDS):
         field = _solve(design, target, robust, bending)
         residual = (target - design @ field).norm(dim=1)
-        robust = base / residual.clamp_min(LEAST_SIGMA)
+        robust = base / residual.clamp_min(MIN_SIGMA)
     inliers = torch.ones_like(base, dtype=torch.bool)
     for turn in range(ROUNDS):
         sigma = MEDIAN_TO_SIGMA * float(residual[inliers].median())
-        kept = residual <= OUTLIER_MADS * max(sigma, LEAST_SIGMA)
+        kept = residual <= OUTLIER_MADS * max(sigma, MIN_SIGMA)
         if turn and bool((kept == inliers).all()):
             break
         inliers = kept

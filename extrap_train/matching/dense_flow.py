@@ -21,7 +21,7 @@ LARGEST_ENLARGEMENT = 2.0
 """Enlarged twice, small pictures are matched to about a tenth of a pixel; more brings nothing."""
 LARGEST_ERROR = 2.0
 """Forward-backward error, in pixels, from which both directions contradict each other."""
-LEAST_SIDE = 16
+MIN_SIDE = 16
 """Smaller pictures have no room for the search's patches, and are padded."""
 
 
@@ -68,7 +68,7 @@ class FlowMatcher:
         scale = min(LARGEST_ENLARGEMENT, self.config.image_size / max(*first.shape, *second.shape))
         working = [_rescale(picture, scale) for picture in (first, second)]
         size = tuple(
-            max(LEAST_SIDE, *sides) for sides in zip(*(x.shape for x in working), strict=True)
+            max(MIN_SIDE, *sides) for sides in zip(*(x.shape for x in working), strict=True)
         )
         a, b = (_bytes(_pad(picture, size)) for picture in working)
         return (

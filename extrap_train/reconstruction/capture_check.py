@@ -33,15 +33,15 @@ SIDE = 960
 """Photographs are matched at this many pixels a side, at most."""
 POSE_SIDE = 640
 """The same, where the poses alone are checked."""
-LEAST_MATCHES = 30
+MIN_MATCHES = 30
 FAR_PIXELS = 4.0
 """Median epipolar distance from which poses are suspect."""
 CLEARLY_BETTER = 0.4
 RATIO = 0.75
 """Largest ratio of the nearest and second nearest distance in Lowe's test."""
-LEAST_POINTS = 8
+MIN_POINTS = 8
 """Least points in a third view: two views already agree on them, so fewer suffice."""
-LEAST_PARALLAX_RAD = np.deg2rad(1.5)
+MIN_PARALLAX_RAD = np.deg2rad(1.5)
 """Least angle between two rays for the point where they meet to be used."""
 MIDDLE, BORDER = 0.4, 0.7
 """Radii as shares of half the diagonal: a lens is checked within the first against beyond the
@@ -87,7 +87,7 @@ class MatchedViews:
     def reprojection(self) -> float:
         """Median distance in the third view; NaN for too few matches."""
         errors = np.linalg.norm(self.third - self.reprojected, axis=1)
-        return _median(errors, LEAST_POINTS)
+        return _median(errors, MIN_POINTS)
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ def _measure(
     distances = epipolar_distance(pixels, matches, fundamental_matrix(camera, nearest))
     starts, ends = torch.from_numpy(pixels).float(), torch.from_numpy(matches).float()
     found = triangulate(starts, ends, camera, nearest)
-    usable = (found.depth > 0) & (found.parallax_rad > LEAST_PARALLAX_RAD)
+    usable = (found.depth > 0) & (found.parallax_rad > MIN_PARALLAX_RAD)
     depth = torch.where(usable, found.depth, torch.nan)[:, None]
     points = transform(camera.cam_to_world, depth * viewing_rays(starts, camera))
     _, in_pairs, in_others = np.intersect1d(
@@ -165,13 +165,13 @@ def _measure(
     return MatchedViews(indices, pixels, matches, distances, points, seen, reprojected.numpy())
 
 
-def _median(values: Float[np.ndarray, " n"], least: int = LEAST_MATCHES) -> float:
+def _median(values: Float[np.ndarray, " n"], least: int = MIN_MATCHES) -> float:
     return float(np.median(values)) if len(values) >= least else float("nan")
 
 
 def _problems(check: CaptureCheck) -> Iterator[str]:
     names = [view.name for view in check.views]
-    lone = [names[m.views[0]] for m in check.matched if len(m.distances) < LEAST_MATCHES]
+    lone = [names[m.views[0]] for m in check.matched if len(m.distances) < MIN_MATCHES]
     if lone:
         yield f"overlap: {_listed(lone)} share too few features with the nearest view to say more"
     off = [m for m in check.matched if m.distance > FAR_PIXELS]
@@ -246,7 +246,7 @@ def _mask_problems(check: CaptureCheck) -> Iterator[str]:
         )
         either = int((first | second).sum())
         differ = int((first ^ second).sum())
-        if either >= LEAST_MATCHES and differ > MASK_DISAGREEMENT * either:
+        if either >= MIN_MATCHES and differ > MASK_DISAGREEMENT * either:
             yield (
                 f"masks: those of {one.name} and {other.name} cut out different things "
                 f"({differ} of {either} matched points)"
@@ -281,7 +281,7 @@ def check_matches(matched: Iterable[tuple[Camera, Camera, Pixels, Pixels]]) -> N
     given: list[float] = []
     others: dict[str, list[float]] = {}
     for one, other, first, second in matched:
-        if len(first) < LEAST_MATCHES:
+        if len(first) < MIN_MATCHES:
             continue
         given.append(_distance(first, second, one, other))
         others_of = _read_otherwise(other)

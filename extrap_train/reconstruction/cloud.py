@@ -9,7 +9,7 @@ from torch.nn import functional
 
 from extrap_train.geometry.cameras import unproject_to_world
 from extrap_train.geometry.warp.surface import normals_from_depth
-from extrap_train.reconstruction.global_map import MOST_COMPARED, GlobalMap, MapView, Sight, look_up
+from extrap_train.reconstruction.global_map import MAX_COMPARED, GlobalMap, MapView, Sight, look_up
 from extrap_train.views import combine
 
 LARGEST_STEP = 0.05
@@ -82,7 +82,7 @@ def _count_votes(
     """Confidence of the most certain view of each point; share of the votes that confirm it."""
     own = known.views[index].confidence.flatten()
     surest, confirmed, contradicted = own, own, torch.zeros_like(own)
-    for other_index in known.nearest(known.views[index].camera, MOST_COMPARED + 1):
+    for other_index in known.nearest(known.views[index].camera, MAX_COMPARED + 1):
         if other_index == index:
             continue
         other = known.views[other_index]

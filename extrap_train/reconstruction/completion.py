@@ -24,7 +24,7 @@ from extrap_train.reconstruction.new_view import Proposal, propose, propose_pred
 from extrap_train.reconstruction.planner import REFERENCES, Query, next_query
 from extrap_train.views import Camera, View, stack_cameras
 
-LEAST_OVERLAP = 50
+MIN_OVERLAP = 50
 """Pixels that two branches must share to be compared."""
 
 
@@ -153,7 +153,7 @@ def loop_error(known: GlobalMap, camera: Camera, neighbours: Sequence[int]) -> f
         return None
     one, other = (prior_of(known, camera, indices) for indices in list(branches.values())[:2])
     both = one.mask & other.mask
-    if int(both.sum()) < LEAST_OVERLAP:
+    if int(both.sum()) < MIN_OVERLAP:
         return None
     apart = (unproject(one.depth, camera) - unproject(other.depth, camera)).norm(dim=-1)
     return float(apart[both].median())

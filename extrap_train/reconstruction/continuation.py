@@ -12,7 +12,7 @@ COLOUR_SCALE = 0.06
 """Difference of colour (of a channel, in [0, 1]) that hints at another surface."""
 REACH = 0.25
 """Share of the picture's side: farther from any known pixel nothing is continued."""
-LEAST_TIE = 1e-3
+MIN_TIE = 1e-3
 """Between neighbours of any colours: everything is connected in the end."""
 
 
@@ -61,7 +61,7 @@ def neighbour_ties(image: Float[np.ndarray, "h w c"]) -> csr_array:
     rows, columns, weights = [], [], []
     for one, other in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         difference = np.abs(image[one] - image[other]).max(-1)
-        weight = (np.exp(-(difference**2)) + LEAST_TIE).ravel()
+        weight = (np.exp(-(difference**2)) + MIN_TIE).ravel()
         rows += [index[one].ravel(), index[other].ravel()]
         columns += [index[other].ravel(), index[one].ravel()]
         weights += [weight, weight]

@@ -18,7 +18,7 @@ from extrap_train.reconstruction.global_map import GlobalMap, MapView
 from extrap_train.store.atomic import write_atomic
 from extrap_train.views import Camera
 
-MOST_COLMAP_POINTS = 50_000
+MAX_COLMAP_POINTS = 50_000
 """COLMAP's points only start a reconstruction: a text of millions helps nobody."""
 DEPTH_UNIT = 0.001
 """Scene units per unit of the depth files: nerfstudio takes this one, whatever the file says."""
@@ -69,7 +69,7 @@ def write_colmap(known: GlobalMap, world: WorldFrame, cloud: PointCloud, folder:
     model = folder / "colmap" / "sparse" / "0"
     _write_lines(model / "cameras.txt", cameras)
     _write_lines(model / "images.txt", images)
-    stride = max(1, -(-len(cloud) // MOST_COLMAP_POINTS))
+    stride = max(1, -(-len(cloud) // MAX_COLMAP_POINTS))
     _write_lines(model / "points3D.txt", _point_lines(cloud, range(0, len(cloud), stride)))
     link = folder / "colmap" / "images"
     if not link.is_symlink():

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrap_train.geometry.cameras import project, unproject_to_world
-from extrap_train.reconstruction.global_map import GIVEN, MOST_COMPARED, GlobalMap, MapView
+from extrap_train.reconstruction.global_map import GIVEN, MAX_COMPARED, GlobalMap, MapView
 from extrap_train.views import stack_cameras
 
 _TRUNCATION = 0.02
@@ -44,7 +44,7 @@ def _fuse(view: MapView, known: GlobalMap) -> tuple[Float[Tensor, "h w"], Float[
     depths = view.depth * (1 + shifts[:, None, None])
     points = unproject_to_world(depths, stack_cameras([view.camera] * _SAMPLES)).flatten(0, 2)
     total, weights = torch.zeros_like(points[:, 0]), torch.zeros_like(points[:, 0])
-    for index in known.nearest(view.camera, MOST_COMPARED):  # itself the first of them
+    for index in known.nearest(view.camera, MAX_COMPARED):  # itself the first of them
         distance, weight = signed_distance(points, known.views[index], _TRUNCATION)
         total += weight * distance
         weights += weight

@@ -77,7 +77,7 @@ def _range_around(
 
 
 GIVEN, GENERATED = "given", "generated"
-MOST_COMPARED = 8
+MAX_COMPARED = 8
 """Views, the nearest ones, that a new one is compared with: the cost of a step stays the same."""
 
 
@@ -153,7 +153,7 @@ class GlobalMap:
         known = view.depth > 0
         points = unproject_to_world(view.depth, view.camera).flatten(0, 1)
         shown = torch.zeros(len(points), dtype=torch.bool)
-        for index in self.nearest(view.camera, MOST_COMPARED):
+        for index in self.nearest(view.camera, MAX_COMPARED):
             shown |= _shown_by(self.views[index], points, self.tolerance)
         fresh = surface_from_depth(view.depth, view.camera).valid & ~shown.view_as(known)
         added = MapView(view, torch.where(known, confidence, 0), fresh, origin)

@@ -31,13 +31,13 @@ _TRUNCATION = 0.03
 seen aslant have whole cells, too."""
 _MARGIN = 2
 _AT_ONCE = 2**19
-_LEAST_WEIGHT = 0.2
+_MIN_WEIGHT = 0.2
 """Least weight of all views together: where it is less, space counts as unseen."""
 _COLORED_BY = 8
 """Points of the cloud: one alone may be of an outline, where colours mix."""
 _FROM_CLOUD = 4 * _CELL
 """Surfaces further from every point of the cloud are only where views contradict each other."""
-_LEAST_SHARE = 0.01
+_MIN_SHARE = 0.01
 """Least share of all faces for a piece of the mesh to be kept."""
 
 
@@ -65,7 +65,7 @@ def mesh_of(known: GlobalMap, cloud: PointCloud) -> trimesh.Trimesh:
     low, high = near.points.amin(0) - _MARGIN * _CELL, near.points.amax(0) + _MARGIN * _CELL
     counts = [int(n) + 1 for n in (high - low) / _CELL]
     mean, weight = _mean_distance(known, low, counts)
-    seen = weight >= _LEAST_WEIGHT
+    seen = weight >= _MIN_WEIGHT
     whole = seen.clone()  # a cell by its upper corner, as marching cubes asks for it
     for axis in range(3):
         whole &= whole.roll(1, axis)
@@ -101,7 +101,7 @@ def _mean_distance(
 def _without_crumbs(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """The mesh without pieces of next to no faces, which a few wrong pixels leave behind."""
     pieces = trimesh.graph.connected_components(mesh.face_adjacency, min_len=1)
-    kept = [piece for piece in pieces if len(piece) >= _LEAST_SHARE * len(mesh.faces)]
+    kept = [piece for piece in pieces if len(piece) >= _MIN_SHARE * len(mesh.faces)]
     mesh.update_faces(np.concatenate([np.empty(0, int), *kept]))
     mesh.remove_unreferenced_vertices()
     return mesh

@@ -17,7 +17,7 @@ from extrap_train.geometry.ncc import ncc_consistent
 from extrap_train.reconstruction.continuation import continued_depth
 from extrap_train.reconstruction.depth_prediction.inference import DepthPredictor
 from extrap_train.reconstruction.global_map import (
-    MOST_COMPARED,
+    MAX_COMPARED,
     GlobalMap,
     Prior,
     Sight,
@@ -197,7 +197,7 @@ def _seen_through(
     """Pixels whose point lies in front of what a more certain view has seen behind it."""
     points = unproject_to_world(depth, camera).flatten(0, 1)
     found = torch.zeros(len(points), dtype=torch.bool)
-    for index in known.nearest(camera, MOST_COMPARED):
+    for index in known.nearest(camera, MAX_COMPARED):
         other = known.views[index]
         said = look_up(points, other.depth, other.camera, 2 * known.tolerance)
         more_certain = other.confidence.flatten()[said.pixel] > confidence.flatten() + AS_SURE

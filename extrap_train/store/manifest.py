@@ -24,7 +24,7 @@ MANIFEST = "manifest.json"
 PUBLISHED = "published"
 """The source of captures that nobody here can name: those of weights that others have trained."""
 _PACKAGES = ("torch", "lightning", "diffusers", "numba", "numpy")
-_MOST_NAMED = 6
+_MAX_NAMED = 6
 
 
 @dataclass(frozen=True)
@@ -83,8 +83,8 @@ class Manifest:
             for category, split in {**dict.fromkeys(before.split), **self.split}.items()
             if split != before.split.get(category)
         ]
-        more = len(found) - _MOST_NAMED
-        return found if more <= 1 else [*found[:_MOST_NAMED], f"and {more} more"]
+        more = len(found) - _MAX_NAMED
+        return found if more <= 1 else [*found[:_MAX_NAMED], f"and {more} more"]
 
 
 def _split_change(before: Split | None, now: Split | None) -> str:

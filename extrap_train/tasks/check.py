@@ -14,24 +14,24 @@ from extrap_train.tasks.scene_inputs import (
 )
 from extrap_train.terminal import terminal
 
-MOST_VIEWS = 24
+MAX_VIEWS = 24
 """Checked unless `inputs` or `input_frames` say otherwise."""
-LEAST_VIEWS = 3
+MIN_VIEWS = 3
 
 
 def run(config: TrainConfig) -> None:
     """Draw `check.png`, replacing an earlier one, and print one line for each thing found."""
     sequence = open_sequence(config)
-    count = config.inputs or min(len(sequence.frames), MOST_VIEWS)
+    count = config.inputs or min(len(sequence.frames), MAX_VIEWS)
     chosen = select_input_frames(sequence, config.input_frames, count)
     frames = [sequence.frames[index] for index in chosen]
     unreadable: list[str] = []
     views = list(load_readable(frames, unreadable, depth=True))
-    if len(views) < LEAST_VIEWS:
+    if len(views) < MIN_VIEWS:
         why = f"; {unreadable[0]}" if unreadable else ""
         raise InputError(
             f"scene {config.scene}: has {len(views)} readable views, and a check takes at least "
-            f"{LEAST_VIEWS}{why}"
+            f"{MIN_VIEWS}{why}"
         )
     check = check_capture(views)
     check.problems.extend(unreadable)

@@ -21,7 +21,7 @@ from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.diffusion.packaged import packaged_name
 from extrap_train.errors import InputError
 from extrap_train.reconstruction.depth_prediction.calibration import DepthScores, calibrate
-from extrap_train.reconstruction.depth_prediction.examples import LEAST_FRAMES, draw_examples
+from extrap_train.reconstruction.depth_prediction.examples import MIN_FRAMES, draw_examples
 from extrap_train.reconstruction.depth_prediction.network import save_depth_network
 from extrap_train.reconstruction.depth_prediction.network_training import (
     DepthTraining,
@@ -51,9 +51,9 @@ def run(config: TrainConfig) -> Outcome:
             f"data={data.name}: task=depth needs captures whose depth is known everywhere; use "
             "data=synthetic"
         )
-    if data.frames < LEAST_FRAMES:
+    if data.frames < MIN_FRAMES:
         raise InputError(
-            f"data.frames={data.frames}: task=depth needs at least {LEAST_FRAMES} a capture"
+            f"data.frames={data.frames}: task=depth needs at least {MIN_FRAMES} a capture"
         )
     folder = Path(config.output) / "depth" / (given_name(config) or config.category.name)
     with claim(folder, _manifest(config), resume=config.resume) as claimed:

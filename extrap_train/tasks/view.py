@@ -26,7 +26,7 @@ from extrap_train.figures import (
     save_picture,
     write_film,
 )
-from extrap_train.geometry.orbits import LEAST_VIEWS, orbit_cameras
+from extrap_train.geometry.orbits import MIN_VIEWS, orbit_cameras
 from extrap_train.metrics import psnr, quantised
 from extrap_train.store.manifest import claim
 from extrap_train.store.records import write_record
@@ -167,9 +167,9 @@ def walk_around(views: Sequence[View], degrees: float, frames: int) -> tuple[Cam
 
 
 def _require_orbit(views: int) -> None:
-    if views < LEAST_VIEWS:
+    if views < MIN_VIEWS:
         raise InputError(
-            f"an orbit needs {LEAST_VIEWS} input views to say which way it leans, not {views}; "
+            f"an orbit needs {MIN_VIEWS} input views to say which way it leans, not {views}; "
             "give more, or a pose="
         )
 

@@ -77,8 +77,8 @@ def corrections(
 
 @pytest.mark.slow
 def test_most_pairs_come_closer(apple: PreparedData, monkeypatch: pytest.MonkeyPatch) -> None:
-    default = correct.LEAST_GAIN
-    monkeypatch.setattr(correct, "LEAST_GAIN", -1.0)
+    default = correct.MIN_GAIN
+    monkeypatch.setattr(correct, "MIN_GAIN", -1.0)
     found = [c for c in corrections(apple) if c.flow is not None]
     gain = np.array([1 - c.error_after / c.error_before for c in found])
     pairs = len(apple.pairs("train"))

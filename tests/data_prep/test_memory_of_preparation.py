@@ -26,10 +26,10 @@ from extrap_train.data.co3d import read_category
 from extrap_train.data.sequences import FrameSequence
 
 FRAMES = 20
-MOST_BYTES_A_FRAME = 1000
+MAX_BYTES_A_FRAME = 1000
 """Seven thousand was what a frame took as JSON, or as a camera of its own."""
 MANY = 10_000
-MOST_BYTES = 2 * 2**30
+MAX_BYTES = 2 * 2**30
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def test_what_is_kept_of_a_frame_is_small(
         assert len(sequences) == count
     slope = (peaks[1] - peaks[0]) / (20 * FRAMES)
     print(f"reading takes {slope:.0f} bytes a frame")
-    assert slope < MOST_BYTES_A_FRAME
+    assert slope < MAX_BYTES_A_FRAME
 
 
 def test_a_job_takes_its_own_sequence_along_and_no_other(photographs: Path) -> None:
@@ -91,7 +91,7 @@ def test_a_job_takes_its_own_sequence_along_and_no_other(photographs: Path) -> N
     annotate(photographs, 2)
     few = job(read_category(photographs, "cup"))
     annotate(photographs, 50)
-    assert job(read_category(photographs, "cup")) == few < MOST_BYTES_A_FRAME * FRAMES
+    assert job(read_category(photographs, "cup")) == few < MAX_BYTES_A_FRAME * FRAMES
 
 
 @pytest.mark.slow
@@ -103,7 +103,7 @@ def test_ten_thousand_sequences_stay_within_two_gibibytes(
         annotate(photographs, count)
         peaks[count] = peak_bytes(photographs, tmp_path / str(count))
         print(f"{count} sequences of {FRAMES} frames, MiB: {peaks[count]}")
-    assert peaks[MANY]["all"] < MOST_BYTES >> 20
+    assert peaks[MANY]["all"] < MAX_BYTES >> 20
     # Its share of pages that are mapped from files hangs on what else runs on the machine.
     assert peaks[MANY]["worker_heap"] < 1.05 * peaks[MANY // 10]["worker_heap"]
 

@@ -41,7 +41,7 @@ from extrap_train.metrics import BACKBONES, lpips_distance, squeeze_lpips
 
 pytestmark = pytest.mark.slow
 
-_MOST_BYTES, _MOST_SECONDS = 4 * 2**30, 20.0
+_MAX_BYTES, _MAX_SECONDS = 4 * 2**30, 20.0
 
 
 def _measured(read: Callable[[], Any], sender: Any) -> None:
@@ -65,7 +65,7 @@ def _outcome(read: Callable[[], Any]) -> tuple[str, float, int]:
     process.start()
     sender.close()
     try:
-        found = receiver.recv() if receiver.poll(10 * _MOST_SECONDS) else ("no end", 99.0, 0)
+        found = receiver.recv() if receiver.poll(10 * _MAX_SECONDS) else ("no end", 99.0, 0)
     except EOFError:
         found = "the process died", 0.0, 0
     if process.is_alive() and found[0] == "no end":
@@ -96,7 +96,7 @@ def _require_sound(
     for name, read in cases:
         said, seconds, peak = _outcome(read)
         count += 1
-        if said not in ("read", "refused") or seconds > _MOST_SECONDS or peak > _MOST_BYTES:
+        if said not in ("read", "refused") or seconds > _MAX_SECONDS or peak > _MAX_BYTES:
             wrong.append(f"{name}: {said} after {seconds:.1f} s with {peak >> 20} MiB")
         if target.exists():
             wrong.append(f"{name}: was executed")

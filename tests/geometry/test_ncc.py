@@ -3,7 +3,7 @@ import torch
 
 from extrap_train.geometry.ncc import (
     CONSISTENT_CORRELATION,
-    LEAST_TEXTURE,
+    MIN_TEXTURE,
     WINDOW,
     ncc_consistent,
     windowed_correlation,
@@ -53,7 +53,7 @@ def test_consistent_windows_are_those_that_numpy_correlates():
         chosen = inside[window]
         x, y = a[window][chosen], b[window][chosen]
         enough = known[row, column] and chosen.sum() > WINDOW**2 / 2
-        textured = enough and max(x.var(), y.var()) > LEAST_TEXTURE
+        textured = enough and max(x.var(), y.var()) > MIN_TEXTURE
         assert bool(comparable[row, column]) == textured
         correlation = np.corrcoef(x, y)[0, 1] if textured and min(x.var(), y.var()) > 0 else 0
         if abs(correlation - CONSISTENT_CORRELATION) > 1e-3:

@@ -17,7 +17,7 @@ from extrap_train.geometry.visibility import Ball
 from extrap_train.reconstruction.completion import CompletionPipeline, add_view, map_of_inputs
 from extrap_train.reconstruction.depth_prediction.calibration import calibrate
 from extrap_train.reconstruction.depth_prediction.examples import (
-    LEAST_FRAMES,
+    MIN_FRAMES,
     DepthExamples,
     draw_examples,
     with_truth,
@@ -305,7 +305,7 @@ def test_examples_are_what_completion_observes_with_the_true_depth(drawn):
 
 
 def test_captures_of_too_few_photographs_are_refused(tmp_path):
-    few = f"data.frames={LEAST_FRAMES - 1}"
+    few = f"data.frames={MIN_FRAMES - 1}"
     said = run_command(main, "task=depth", "category=cup", few, f"output={tmp_path}", status=1)
     assert said.startswith(f"error: {few}")
     assert not [*tmp_path.iterdir()]

@@ -17,9 +17,9 @@ SAMPLES = 4000
 """Pixels that vote for the second camera: the surest half, thinned out evenly."""
 TOLERANCE = 0.01
 """Reprojection error of an inlier, as a share of the picture's longer side."""
-LEAST_INLIERS = 0.2
+MIN_INLIERS = 0.2
 """Share of the votes below which a camera is not found."""
-LEAST_PARALLAX_RAD = math.radians(1)
+MIN_PARALLAX_RAD = math.radians(1)
 """The baseline, seen from the middle of the points: a shorter one has no reliable scale."""
 LARGEST_CONTRADICTION_RAD = math.radians(20)
 """Between predicted and known rotation, and between the two directions of the baseline."""
@@ -73,7 +73,7 @@ def predicted_pose(
         )
     except cv2.error:  # what it says of degenerate points
         return None
-    if not found or inliers is None or len(inliers) < LEAST_INLIERS * len(votes):
+    if not found or inliers is None or len(inliers) < MIN_INLIERS * len(votes):
         return None
     inside = inliers[:, 0]
     rotation, translation = cv2.solvePnPRefineLM(
@@ -94,7 +94,7 @@ def pair_scale(
     """
     baselines = [-(pose[:3, :3].T @ pose[:3, 3]) for pose in (predicted, known)]
     lengths = [float(baseline.norm()) for baseline in baselines]
-    if lengths[0] < math.tan(LEAST_PARALLAX_RAD) * abs(typical_depth) or lengths[1] == 0:
+    if lengths[0] < math.tan(MIN_PARALLAX_RAD) * abs(typical_depth) or lengths[1] == 0:
         return None
     between = float(baselines[0] @ baselines[1]) / (lengths[0] * lengths[1])
     turn = float((predicted[:3, :3] @ known[:3, :3].T).trace() - 1) / 2

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from extrap_train.geometry.warp.query_projection import LEAST_DEPTH_RATIO, project_pixels, subdivide
+from extrap_train.geometry.warp.query_projection import MIN_DEPTH_RATIO, project_pixels, subdivide
 from extrap_train.geometry.warp.splat import ScreenPoints
 from extrap_train.geometry.warp.surface import Surface
 from extrap_train.views import Camera
@@ -66,7 +66,7 @@ def occlusion_depth(
     )
     column, row = torch.floor(x), torch.floor(y)
     inside = (column >= 0) & (column < query.width) & (row >= 0) & (row < query.height)
-    drawn = (inside & (ratio > LEAST_DEPTH_RATIO)).nonzero()[:, 0]
+    drawn = (inside & (ratio > MIN_DEPTH_RATIO)).nonzero()[:, 0]
     pixel = (image[wall[drawn]] * query.height + row[drawn].long()) * query.width
     depth = (ratio / inverse)[drawn].to(empty.dtype)
     filled = empty.scatter_reduce(0, pixel + column[drawn].long(), depth, "amin")

@@ -6,10 +6,10 @@ import numpy as np
 
 from extrap_train.geometry.compiled import compiled
 from extrap_train.geometry.warp import occlusion
-from extrap_train.geometry.warp.query_projection import LEAST_DEPTH_RATIO
+from extrap_train.geometry.warp.query_projection import MIN_DEPTH_RATIO
 
 _HALF, _ONE, _TWO = np.float32(0.5), np.float32(1), np.float32(2)
-_LEAST_RATIO = np.float32(LEAST_DEPTH_RATIO)
+_MIN_RATIO = np.float32(MIN_DEPTH_RATIO)
 _DEPTH_PER_WIDTH = np.float32(occlusion.DEPTH_PER_WIDTH)
 _SPACING = np.float32(occlusion.SPACING)
 _MAX_WALL_POINTS = np.float32(occlusion.MAX_WALL_POINTS)
@@ -22,7 +22,7 @@ def project(m, u, v, inverse):
     x = m[0, 0] * u + m[0, 1] * v + m[0, 2] + m[0, 3] * inverse
     y = m[1, 0] * u + m[1, 1] * v + m[1, 2] + m[1, 3] * inverse
     ratio = m[2, 0] * u + m[2, 1] * v + m[2, 2] + m[2, 3] * inverse
-    safe = ratio if ratio > _LEAST_RATIO else _ONE
+    safe = ratio if ratio > _MIN_RATIO else _ONE
     return x / safe, y / safe, ratio
 
 
@@ -73,6 +73,6 @@ def _draw_wall(m, u, v, start, stop, upright, unseen):
             x, y, ratio = project(
                 m, u if upright else u + aside, v + aside if upright else v, inverse
             )
-            if ratio > _LEAST_RATIO and 0 <= x < width and 0 <= y < height:
+            if ratio > _MIN_RATIO and 0 <= x < width and 0 <= y < height:
                 row, column = int(y), int(x)
                 unseen[row, column] = min(unseen[row, column], ratio / inverse)

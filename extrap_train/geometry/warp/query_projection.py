@@ -6,7 +6,7 @@ from torch import Tensor
 
 from extrap_train.views import Camera
 
-LEAST_DEPTH_RATIO = 1e-3
+MIN_DEPTH_RATIO = 1e-3
 """Points that much nearer to the query than to the reference are not drawn: they would fill the
 image."""
 
@@ -35,7 +35,7 @@ def project_pixels(
         + matrix[..., i, 3] * inverse
         for i in range(3)
     )
-    safe = torch.where(ratio > LEAST_DEPTH_RATIO, ratio, 1)
+    safe = torch.where(ratio > MIN_DEPTH_RATIO, ratio, 1)
     return x / safe, y / safe, ratio
 
 

@@ -10,7 +10,7 @@ from extrap_train.geometry.cameras import coordinate_grid, pixel_grid
 from extrap_train.geometry.spline_flow import flow_at_pixels
 from extrap_train.geometry.warp.occlusion import is_occluded
 from extrap_train.geometry.warp.query_projection import (
-    LEAST_DEPTH_RATIO,
+    MIN_DEPTH_RATIO,
     project_pixels,
     reference_to_query_pixels,
     subdivide,
@@ -71,7 +71,7 @@ def sample_surfaces(
         inverse,
     )
     inside = (u > -0.5) & (u < query.width + 0.5) & (v > -0.5) & (v < query.height + 0.5)
-    seen = (inside & (inverse > 0) & (ratio > LEAST_DEPTH_RATIO)).nonzero()[:, 0]
+    seen = (inside & (inverse > 0) & (ratio > MIN_DEPTH_RATIO)).nonzero()[:, 0]
     # A point stands for a parallelogram of the query; it reaches half of that one's bounding box.
     edges = (steps.reshape(-1, 2, 2)[pixel[seen]] / counts[pixel[seen], :, None]).abs()
     reach = ((edges[:, 0] + edges[:, 1]) / 2 + REACH_MARGIN).clamp(max=1)
@@ -115,7 +115,7 @@ def _query_steps(
     for axis, slope in ((0, (left + right) / 2), (1, (up + low) / 2)):
         x, y, z = (matrix[..., i, axis] + slope * matrix[..., i, 3] for i in range(3))
         steps.append(torch.stack([x - u * z, y - v * z], -1))
-    return torch.stack(steps, -2) / ratio.clamp(min=LEAST_DEPTH_RATIO)[..., None, None]
+    return torch.stack(steps, -2) / ratio.clamp(min=MIN_DEPTH_RATIO)[..., None, None]
 
 
 def _points_per_axis(steps: Float[Tensor, "b k h w 2 2"]) -> Int[Tensor, "b k h w 2"]:

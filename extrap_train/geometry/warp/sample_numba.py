@@ -17,7 +17,7 @@ from extrap_train.geometry.compiled import compiled
 from extrap_train.geometry.spline_flow import flow_at_pixels
 from extrap_train.geometry.warp import occlusion, sample
 from extrap_train.geometry.warp.occlusion_numba import draw_occlusion, project
-from extrap_train.geometry.warp.query_projection import LEAST_DEPTH_RATIO, reference_to_query_pixels
+from extrap_train.geometry.warp.query_projection import MIN_DEPTH_RATIO, reference_to_query_pixels
 from extrap_train.geometry.warp.sample import query_centers
 from extrap_train.geometry.warp.surface_numba import find_surface
 from extrap_train.views import Camera
@@ -26,7 +26,7 @@ _ZERO, _HALF, _ONE, _TWO = (np.float32(x) for x in (0, 0.5, 1, 2))
 _LARGEST_SPACING = np.float32(sample.LARGEST_SPACING)
 _REACH_MARGIN = np.float32(sample.REACH_MARGIN)
 _MAX_POINTS = sample.MAX_POINTS_PER_AXIS
-_LEAST_RATIO = np.float32(LEAST_DEPTH_RATIO)
+_MIN_RATIO = np.float32(MIN_DEPTH_RATIO)
 _WALL_LIMIT = np.float32(1 + occlusion.TOLERANCE)
 _RIM = np.float32(1.5)
 """Query pixels around the image: the splat draws what lies half a pixel outside; the rest is for
@@ -193,8 +193,8 @@ def _divide(m, inverse, slopes, y, x):
 def _step(m, u, v, ratio, axis, slope):
     """Movement in the query, along its u and v, for one reference pixel along an axis."""
     z = m[2, axis] + slope * m[2, 3]
-    across = (m[0, axis] + slope * m[0, 3] - u * z) / max(ratio, _LEAST_RATIO)
-    down = (m[1, axis] + slope * m[1, 3] - v * z) / max(ratio, _LEAST_RATIO)
+    across = (m[0, axis] + slope * m[0, 3] - u * z) / max(ratio, _MIN_RATIO)
+    down = (m[1, axis] + slope * m[1, 3] - v * z) / max(ratio, _MIN_RATIO)
     return abs(across), abs(down)
 
 
@@ -281,7 +281,7 @@ def _is_seen(u, v, ratio, inverse, unseen):
     never saw."""
     height, width = unseen.shape
     inside = -_HALF < u < np.float32(width) + _HALF and -_HALF < v < np.float32(height) + _HALF
-    if not (inside and inverse > _ZERO and ratio > _LEAST_RATIO):
+    if not (inside and inverse > _ZERO and ratio > _MIN_RATIO):
         return False
     row, column = min(max(int(v), 0), height - 1), min(max(int(u), 0), width - 1)
     return not ratio / inverse > unseen[row, column] * _WALL_LIMIT

@@ -28,9 +28,9 @@ from extrap_train.views import Camera, View, combine, stack_poses
 Truth = Callable[[Camera], tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]]
 """A capture's depth and object mask from any camera, in its own world and unit."""
 
-LEAST_FRAMES = 12
+MIN_FRAMES = 12
 """Frames that a capture needs, so that neighbouring photographs stand at most 30° apart."""
-MOST_INPUTS = 6
+MAX_INPUTS = 6
 """Most photographs that a capture is completed from; the fewest are three."""
 STEP_DEG = (22.0, 40.0)
 """Range of the angle between neighbouring views of the orbit."""
@@ -63,7 +63,7 @@ def draw_examples(
     measured. Generated views enter the map with the true depth, spoiled smoothly. Each is observed
     twice: when it is generated, and from its nearest neighbours once all views are there.
     """
-    count = int(rng.integers(3, MOST_INPUTS + 1))
+    count = int(rng.integers(3, MAX_INPUTS + 1))
     chosen = [
         frames[i] for i in choose_frames(frames, count, (), "one_sided", int(rng.integers(99)))
     ]

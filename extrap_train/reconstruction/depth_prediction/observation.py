@@ -19,7 +19,7 @@ LARGEST_UNOBSERVED = 0.04
 hypothesis."""
 FARTHEST = 2.0
 """Bound of log depths, in which the scene's centre lies at 0."""
-_LEAST_RATIO = 0.05
+_MIN_RATIO = 0.05
 
 
 @dataclass(frozen=True)
@@ -105,4 +105,4 @@ def observe(
 
 
 def _log(ratio: Tensor) -> Tensor:
-    return ratio.clamp(min=_LEAST_RATIO).log().clamp(max=FARTHEST)
+    return ratio.clamp(min=_MIN_RATIO).log().clamp(max=FARTHEST)
