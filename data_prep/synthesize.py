@@ -51,7 +51,7 @@ class _Record:
 
 
 @dataclass(frozen=True)
-class _Job:
+class _Rendering:
     """One sequence to render."""
 
     root: Path
@@ -85,7 +85,7 @@ def synthesize(config: SyntheticConfig, category: str, root: Path, launcher: Lau
         "image_size": config.image_size,
     }
     count = config.test_sequences + config.train_sequences
-    jobs = [_Job(root, category, index, options) for index in range(count)]
+    jobs = [_Rendering(root, category, index, options) for index in range(count)]
     _require_ours(root / category, jobs)
     states = [_state(job) for job in jobs]
     missing = [job for job, state in zip(jobs, states, strict=True) if state != "ready"]
@@ -96,7 +96,7 @@ def synthesize(config: SyntheticConfig, category: str, root: Path, launcher: Lau
     _annotate(root, category, [record for record in records if record], config.test_sequences)
 
 
-def _require_ours(folder: Path, jobs: list[_Job]) -> None:
+def _require_ours(folder: Path, jobs: list[_Rendering]) -> None:
     """Raise InputError where a category's folder, or one in it to be replaced, is not ours."""
     there = _entries(folder)
     made = {path.name for path in there if (path / RECORD).exists()}
@@ -132,7 +132,7 @@ def _foreign_annotations(folder: Path, made: set[str]) -> list[Path]:
     return [] if ours.issuperset(listed) else [file]
 
 
-def _state(job: _Job) -> str:
+def _state(job: _Rendering) -> str:
     """`ready`, `missing`, or `outdated`: made with other options."""
     if not (job.folder / RECORD).exists():
         return "missing"
@@ -161,7 +161,7 @@ def _announce(category: str, root: Path, states: list[str]) -> None:
         print(f"{root / category}: {ready} of {len(states)} sequences are there already")
 
 
-def _render_all(jobs: list[_Job], launcher: Launcher) -> None:
+def _render_all(jobs: list[_Rendering], launcher: Launcher) -> None:
     """Renders the jobs, with a progress bar."""
     if not jobs:
         return
@@ -171,7 +171,7 @@ def _render_all(jobs: list[_Job], launcher: Launcher) -> None:
             raise InputError(f"{jobs[index].folder}: not rendered: {result.reason}")
 
 
-def _render_sequence(job: _Job) -> None:
+def _render_sequence(job: _Rendering) -> None:
     """Render into a folder beside the final one, then rename it."""
     options = job.options
     scene = build_scene(job.category, job.index, options["seed"])

@@ -28,7 +28,7 @@ from extrap_train.store.atomic import file_lock, remove_leftovers, write_atomic
 from extrap_train.store.manifest import MANIFEST, Manifest, require_same
 from extrap_train.store.records import write_record
 
-Row = dict[str, str]
+JobRow = dict[str, str]
 METRIC = "result."
 """Prefix of the metrics' columns, which keeps them apart from options of the same name."""
 _TABLE = "sweep.csv"
@@ -112,7 +112,7 @@ def _ended_in_one_line(folder: Path) -> Iterator[None]:
         sys.exit(f"error: {place}: {error.strerror}; give another hydra.sweep.dir")
 
 
-def row_of(number: int, seconds: float, job: JobReturn) -> Row:
+def row_of(number: int, seconds: float, job: JobReturn) -> JobRow:
     """Number, status, time, overrides, final metrics, and why it failed if it did.
 
     The metrics are those of `summary.json` in the folder that the task returned.
@@ -140,7 +140,7 @@ def _options(overrides: Iterable[str]) -> dict[str, str]:
     return {name: value for name, value in options.items() if name != "output"}
 
 
-def _give_objective(job: JobReturn, row: Row, objective: str) -> None:
+def _give_objective(job: JobReturn, row: JobRow, objective: str) -> None:
     """Make the metric the job's value instead of the folder; a job that lacks it has failed."""
     found = row.get(METRIC + objective)
     if found is not None:
@@ -175,7 +175,7 @@ def _numbers(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, float
     return found
 
 
-def add_row(file: Path, row: Row) -> pd.DataFrame:
+def add_row(file: Path, row: JobRow) -> pd.DataFrame:
     """All rows as texts, sorted by job number, with the new one among them; written at once.
 
     Columns are those of any row: an empty cell means that the job did not have it.

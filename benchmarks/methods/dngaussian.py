@@ -15,7 +15,7 @@ from extrap_train.gaussians.gaussian_options import MIN_BETWEEN_GROWTH
 from extrap_train.gaussians.init import nearest_expected
 from extrap_train.gaussians.losses import fill_unknown, patch_depth_loss
 from extrap_train.gaussians.rasterize import draw
-from extrap_train.gaussians.recipe import Objective, Recipe, Step, Training
+from extrap_train.gaussians.recipe import Objective, OptimiserStep, Recipe, Training
 from extrap_train.gaussians.training_scene import TrainingScene
 from extrap_train.views import Camera
 
@@ -69,7 +69,7 @@ class DnGaussianRecipe(Recipe):
         directions = nn.functional.normalize(means - camera.center.detach(), dim=-1)
         return self._neural(means, directions)
 
-    def steps(self, training: Training) -> Sequence[Step]:
+    def steps(self, training: Training) -> Sequence[OptimiserStep]:
         """Hard depth, later on soft depth, and the photograph."""
         late = training.iteration > training.schedule.at(self.options.soft_from)
         soft = (self._soft_step,) if late else ()

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks.perf.timing import Row, compare
+from benchmarks.perf.timing import Timing, compare
 from benchmarks.perf.warp_timing import bumpy_depth, orbit_camera
 from extrap_train.geometry.alignment import Edges, align_view
 from extrap_train.geometry.cameras import pixel_grid, transform, unproject_to_world
@@ -58,12 +58,12 @@ NOISES: dict[str, Noise] = {
 }
 
 
-def run() -> list[Row]:
+def run() -> list[Timing]:
     """One row per kind of noise; the case names both mean relative depth errors."""
     return [_compare(name, noise) for name, noise in NOISES.items()]
 
 
-def _compare(name: str, noise: Noise) -> Row:
+def _compare(name: str, noise: Noise) -> Timing:
     camera, depth, edges = bumpy_edges(SIZE, noise)
 
     def ours() -> Float[Tensor, "h w"]:

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_avg_fn
 
 from benchmarks.perf.diffusion_case import configuration
-from benchmarks.perf.timing import Row, compare, devices
+from benchmarks.perf.timing import Timing, compare, devices
 from extrap_train.diffusion.averaging import AveragedModule
 from extrap_train.diffusion.model import ExtrapolationModel
 
@@ -21,12 +21,12 @@ DECAY = 0.05
 _REPEATS = 5
 
 
-def run() -> list[Row]:
+def run() -> list[Timing]:
     """One row per device; on the CPU the seconds of a core, too."""
     return [compare_averages(FULL_WIDTH, device) for device in devices()]
 
 
-def compare_averages(width: int, device: torch.device, repeats: int = _REPEATS) -> Row:
+def compare_averages(width: int, device: torch.device, repeats: int = _REPEATS) -> Timing:
     """The denoiser's tensors, `width` channels at its finest level; three times in memory."""
     unet = unet_weights(width, device)
     ours = AveragedModule(deepcopy(unet), device, DECAY)

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils.flop_counter import FlopCounterMode
 
-from benchmarks.perf.timing import Row, compare
+from benchmarks.perf.timing import Timing, compare
 from benchmarks.perf.warp_timing import ANGLES_DEG, QUERY_ANGLE_DEG, orbit_camera
 from extrap_train.config import ClipConfig, ModelConfig, UNetConfig, VaeConfig
 from extrap_train.diffusion.encoders import Frozen
@@ -36,7 +36,7 @@ def compare_models(
     ours: Callable[[ExtrapolationModel, PairBatch], Run],
     reference: Callable[[ExtrapolationModel, PairBatch], Run],
     repeats: int,
-) -> list[Row]:
+) -> list[Timing]:
     """One row per batch size, on a GPU with torch.compile as well.
 
     Prints the speed and memory of both, each of which costs `passes` forward passes an image.

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks.perf.timing import Row, compare, devices
+from benchmarks.perf.timing import Timing, compare, devices
 from benchmarks.perf.warp_timing import orbit_camera
 from extrap_train.gaussians.density import rotation_matrices
 from extrap_train.gaussians.losses import photometric_loss, prepare_truth
@@ -29,10 +29,10 @@ TILE = 16
 _MAX_SIGMAS = 3.33
 """Beyond, even an opaque Gaussian covers less than MIN_ALPHA."""
 
-Draw = Callable[..., Float[Tensor, "h w 3"]]
+DrawImage = Callable[..., Float[Tensor, "h w 3"]]
 
 
-def run() -> list[Row]:
+def run() -> list[Timing]:
     """One row per number of Gaussians and image size; where there is a GPU, gsplat's, too."""
     rows = []
     for device in devices():
@@ -41,7 +41,7 @@ def run() -> list[Row]:
     return rows
 
 
-def _compare(count: int, size: int, device: torch.device, job: Callable) -> Row:
+def _compare(count: int, size: int, device: torch.device, job: Callable) -> Timing:
     camera = orbit_camera(0.0, size).to(device)
     rasterize = rasterizer("gsplat" if device.type == "cuda" else "numba")
 
@@ -59,7 +59,7 @@ def _compare(count: int, size: int, device: torch.device, job: Callable) -> Row:
     return compare(name, device, mine, theirs, _REPEATS)
 
 
-def _differentiate(draw: Draw, inputs: list[Tensor]) -> Callable[[], Float[Tensor, "h w 3"]]:
+def _differentiate(draw: DrawImage, inputs: list[Tensor]) -> Callable[[], Float[Tensor, "h w 3"]]:
     """The squared difference of the image from grey, differentiated by all inputs."""
     leaves = [x.requires_grad_() for x in inputs]
 
@@ -71,7 +71,7 @@ def _differentiate(draw: Draw, inputs: list[Tensor]) -> Callable[[], Float[Tenso
     return once
 
 
-def _train(draw: Draw, inputs: list[Tensor]) -> Callable[[], Float[Tensor, "h w 3"]]:
+def _train(draw: DrawImage, inputs: list[Tensor]) -> Callable[[], Float[Tensor, "h w 3"]]:
     """A step of 3DGS: drawing, 0.8 L1 + 0.2 (1 − SSIM), gradients, Adam."""
     means, quats, scales, opacities, colors = inputs
     free = [means, quats, scales.log(), opacities.logit(), colors]

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks.perf.timing import Row, compare
+from benchmarks.perf.timing import Timing, compare
 from data_prep.preparation import prepare
 from data_prep.synthesize import synthesize
 from extrap_train.config import FlowMatcherConfig, PrepConfig, StereoConfig, SyntheticConfig
@@ -27,7 +27,7 @@ _REPEATS = 2
 """A round takes minutes."""
 
 
-def run() -> list[Row]:
+def run() -> list[Timing]:
     """The row of two workers against one; they must find the same errors."""
     folder = Path(tempfile.mkdtemp())
     threads = torch.get_num_threads(), numba.get_num_threads()

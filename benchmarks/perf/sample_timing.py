@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from benchmarks.perf.diffusion_case import Run, compare_models
-from benchmarks.perf.timing import Row, devices
+from benchmarks.perf.timing import Timing, devices
 from extrap_train.config import SamplerConfig
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.sampler import ddim_timesteps, sample_ddim, sample_views, view_generator
@@ -18,7 +18,7 @@ _STEPS = {"cpu": 2, "cuda": 50}
 _REPEATS = {"cpu": 3, "cuda": 5}
 
 
-def run() -> list[Row]:
+def run() -> list[Timing]:
     """One row per device and batch size.
 
     On a GPU also with torch.compile, which the validations of a training with trainer.compile=true

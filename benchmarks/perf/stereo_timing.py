@@ -2,7 +2,7 @@
 
 import torch
 
-from benchmarks.perf.timing import Row, compare
+from benchmarks.perf.timing import Timing, compare
 from benchmarks.perf.warp_timing import ANGLES_DEG, bumpy_depth, orbit_camera
 from extrap_train.depth.photo_cost import CHUNK_ELEMENTS, PhotoCost
 from extrap_train.depth.plane_sweep import semi_global_cost, semi_global_torch
@@ -12,12 +12,12 @@ SIZES = (128, 256)
 PLANES = 96
 
 
-def run() -> list[Row]:
+def run() -> list[Timing]:
     """Rows for every image size; on the CPU, where there are two implementations."""
     return [row for size in SIZES for row in _compare(size)]
 
 
-def _compare(size: int) -> list[Row]:
+def _compare(size: int) -> list[Timing]:
     generator = torch.Generator().manual_seed(0)
     image = torch.rand(3, size, size, generator=generator)
     view, *others = (View(image, orbit_camera(angle_deg, size)) for angle_deg in ANGLES_DEG)

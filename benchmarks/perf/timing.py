@@ -16,7 +16,7 @@ from extrap_train.store.atomic import write_atomic
 
 
 @dataclass(frozen=True)
-class Row:
+class Timing:
     """One line of `perf/<name>.csv`."""
 
     case: str
@@ -40,7 +40,7 @@ def compare(
     ours: Callable[[], Float[Tensor, "..."]],
     reference: Callable[[], Float[Tensor, "..."]],
     repeats: int = 15,
-) -> Row:
+) -> Timing:
     """Run both in turn, so that whatever else the machine does hits both; one round to warm up.
 
     Prints the outcome on standard error: the next row may take minutes.
@@ -50,7 +50,7 @@ def compare(
         (_milliseconds(ours, device), _milliseconds(reference, device)) for _ in range(repeats)
     ]
     ours_ms, reference_ms = (statistics.median(side) for side in zip(*pairs, strict=True))
-    row = Row(case, device.type, ours_ms, reference_ms, reference_ms / ours_ms, difference)
+    row = Timing(case, device.type, ours_ms, reference_ms, reference_ms / ours_ms, difference)
     print(
         f"{case}, {row.device}: {ours_ms:.4g} ms, reference {reference_ms:.4g} ms, "
         f"{row.ratio:.3g} times",
@@ -60,12 +60,12 @@ def compare(
     return row
 
 
-def write_rows(rows: Sequence[Row], path: Path) -> None:
+def write_rows(rows: Sequence[Timing], path: Path) -> None:
     """Write the rows as CSV."""
     write_atomic(path, pd.DataFrame(rows).to_csv(index=False, float_format="%.4g").encode())
 
 
-def print_rows(rows: Sequence[Row]) -> None:
+def print_rows(rows: Sequence[Timing]) -> None:
     """Print the same columns, aligned."""
     print(pd.DataFrame(rows).to_string(index=False, float_format=lambda value: f"{value:.4g}"))
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from benchmarks.perf.diffusion_case import Run, compare_models
-from benchmarks.perf.timing import Row, devices
+from benchmarks.perf.timing import Timing, devices
 from extrap_train.diffusion.loss import diffusion_loss
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.step_noise import StepNoise
@@ -20,7 +20,7 @@ _FORWARD_AND_BACKWARD = 3
 _REPEATS = {"cpu": 3, "cuda": 15}
 
 
-def run() -> list[Row]:
+def run() -> list[Timing]:
     """One row per device and batch size, on a GPU also with torch.compile."""
     ours, plain = (partial(training_step, optimised=is_ours) for is_ours in (True, False))
     return [

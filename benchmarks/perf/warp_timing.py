@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks.perf.timing import Row, compare, devices
+from benchmarks.perf.timing import Timing, compare, devices
 from extrap_train.geometry.cameras import unproject_to_world
 from extrap_train.geometry.visibility import Ball, Visibility, trace_torch, trace_visibility
 from extrap_train.geometry.warp import splat_points
@@ -24,13 +24,13 @@ ANGLES_DEG = (0.0, -30.0, 40.0)
 QUERY_ANGLE_DEG = 15.0
 
 
-def run() -> list[Row]:
+def run() -> list[Timing]:
     """Rows for every image size; on the GPU, too, where there is one."""
     rows = [_compare_splats(size, device) for device in devices() for size in SIZES]
     return [*rows, *(_compare_visibility(size) for size in VISIBILITY_SIZES)]
 
 
-def _compare_splats(size: int, device: torch.device) -> Row:
+def _compare_splats(size: int, device: torch.device) -> Timing:
     points, values = (x.to(device) for x in bumpy_views(size))
     query = orbit_camera(QUERY_ANGLE_DEG, size).to(device)
 
@@ -42,7 +42,7 @@ def _compare_splats(size: int, device: torch.device) -> Row:
     )
 
 
-def _compare_visibility(size: int) -> Row:
+def _compare_visibility(size: int) -> Timing:
     """Unobserved space along the rays of a query from aside; on the CPU, where there are two
     implementations of it."""
     references = stack_cameras([orbit_camera(angle, size) for angle in ANGLES_DEG])

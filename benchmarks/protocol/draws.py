@@ -35,6 +35,7 @@ class Draw:
     sequence: str
     n_views: int
     draw: str
+    """How the inputs were drawn: one of `rules.draws`."""
     seed: int
     inputs: tuple[str, ...]
     targets: tuple[str, ...]
@@ -91,8 +92,11 @@ def digest(content: Any) -> str:
 def draw_sequence(
     category: str, sequence: str, names: Sequence[str], cameras: Camera, rules: RulesConfig
 ) -> list[Draw]:
-    """Every draw of one capture: kinds × seeds × numbers of views.
+    """Every draw of one capture for a table: kinds × seeds × numbers of views.
 
+    Tables alone draw like this, from a pool of the capture, so that all methods share the targets;
+    the commands choose inputs with `data.square_frames.select_input_frames` (all tasks about a
+    scene) and `reconstruction.inputs.choose_frames` (`task=complete`).
     The draws of one kind and seed are nested, so that what six views add to three is theirs. Raises
     InputError where there are fewer frames than the pool takes.
     """

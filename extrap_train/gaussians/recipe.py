@@ -48,7 +48,7 @@ class Objective:
     drawing: Drawing | None = None
 
 
-Step = Callable[[Training, int], Objective]
+OptimiserStep = Callable[[Training, int], Objective]
 """Takes the training and the index of the input view whose turn it is."""
 
 
@@ -135,7 +135,7 @@ class Recipe:
             self.colors(parameters, camera),
         )
 
-    def steps(self, training: Training) -> Sequence[Step]:
+    def steps(self, training: Training) -> Sequence[OptimiserStep]:
         """The optimiser's steps of one iteration."""
         return (self.photometric_step,)
 

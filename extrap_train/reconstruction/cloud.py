@@ -81,7 +81,7 @@ def _count_votes(
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
     """Confidence of the most certain view of each point; share of the votes that confirm it."""
     own = known.views[index].confidence.flatten()
-    surest, confirmed, contradicted = own, own, torch.zeros_like(own)
+    highest, confirmed, contradicted = own, own, torch.zeros_like(own)
     for other_index in known.nearest(known.views[index].camera, MAX_COMPARED + 1):
         if other_index == index:
             continue
@@ -89,9 +89,9 @@ def _count_votes(
         said = look_up(points, other.depth, other.camera, 2 * known.tolerance)
         confidence = other.confidence.flatten()[said.pixel]
         agrees = torch.where(said.sight == Sight.AGREES, confidence, 0)
-        surest, confirmed = torch.maximum(surest, agrees), confirmed + agrees
+        highest, confirmed = torch.maximum(highest, agrees), confirmed + agrees
         contradicted = contradicted + torch.where(said.sight == Sight.IN_FRONT, confidence, 0)
-    return surest, confirmed / (confirmed + contradicted).clamp(min=1e-6)
+    return highest, confirmed / (confirmed + contradicted).clamp(min=1e-6)
 
 
 def _subdivide(

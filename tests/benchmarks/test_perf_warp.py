@@ -5,7 +5,7 @@ import csv
 import torch
 
 from benchmarks.__main__ import main
-from benchmarks.perf.timing import Row, compare, write_rows
+from benchmarks.perf.timing import Timing, compare, write_rows
 from benchmarks.perf.warp_timing import bumpy_views, orbit_camera, splat_reference
 from extrap_train.geometry.warp import splat_points
 
@@ -21,7 +21,7 @@ def test_reference_is_equal():
 
 def test_rows_are_written_with_the_contract_columns(tmp_path):
     row = compare("case", torch.device("cpu"), lambda: torch.ones(2), lambda: torch.zeros(2), 3)
-    assert isinstance(row, Row)
+    assert isinstance(row, Timing)
     write_rows([row], tmp_path / "perf" / "x.csv")
     with (tmp_path / "perf" / "x.csv").open() as file:
         (line,) = csv.DictReader(file)

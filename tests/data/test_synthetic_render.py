@@ -7,10 +7,10 @@ import torch
 from extrap_train.data.synthetic import build_scene, handheld_orbit, render
 from extrap_train.data.synthetic.light import Light
 from extrap_train.data.synthetic.material import (
+    LocalPoints,
     Material,
     Mottled,
     Plain,
-    Surface,
     linear_to_srgb,
     srgb_to_linear,
 )
@@ -124,7 +124,7 @@ def test_textures_finer_than_a_pixel_fade_to_their_mean():
     texture = Mottled(np.zeros(3), np.ones(3), frequency=10.0, seed=1)
 
     def spread(footprint):
-        surface = Surface(points, points, np.full(len(points), footprint, np.float32))
+        surface = LocalPoints(points, points, np.full(len(points), footprint, np.float32))
         return texture(surface).std()
 
     assert spread(0.0) > 0.15

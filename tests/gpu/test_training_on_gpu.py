@@ -19,7 +19,7 @@ from benchmarks.perf.diffusion_case import (
     optimised,
     plain,
 )
-from benchmarks.perf.timing import Row, compare
+from benchmarks.perf.timing import Timing, compare
 from benchmarks.perf.train_timing import training_step
 from extrap_train.__main__ import main
 from extrap_train.diffusion.averaging import AveragedModule, AveragedWeights
@@ -120,7 +120,7 @@ def test_throughput_at_full_size(gpu: torch.device, capsys: pytest.CaptureFixtur
     assert average.max_abs_diff < 1e-6
 
 
-def _compare_warps(gpu: torch.device, batch: PairBatch) -> Row:
+def _compare_warps(gpu: torch.device, batch: PairBatch) -> Timing:
     """On the GPU against the CPU's compiled loops, which batches would be sent from otherwise."""
     bare = [PairBatch(**(vars(batch.to(device)) | {"warp": None})) for device in (gpu, "cpu")]
 

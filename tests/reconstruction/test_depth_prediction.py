@@ -16,7 +16,7 @@ from extrap_train.errors import InputError
 from extrap_train.geometry.visibility import Ball
 from extrap_train.reconstruction.completion import CompletionPipeline, add_view, map_of_inputs
 from extrap_train.reconstruction.depth_prediction.calibration import calibrate
-from extrap_train.reconstruction.depth_prediction.examples import (
+from extrap_train.reconstruction.depth_prediction.depth_examples import (
     MIN_FRAMES,
     DepthExamples,
     draw_examples,

@@ -7,7 +7,7 @@ from extrap_train.data.synthetic.material import (
     Mottled,
     Plaid,
     Texture,
-    Tiles,
+    Tiling,
     Worn,
     linear_color,
     vary_color,
@@ -46,7 +46,7 @@ def pavement(rng: np.random.Generator) -> Texture:
     tone = vary_color(rng, STONES)
     size = rng.uniform(0.35, 0.9)
     stone = Mottled(tone * 0.75, tone * 1.2, rng.uniform(3, 7), draw_seed(rng), 3, 0.8)
-    return Tiles(
+    return Tiling(
         stone, tone * 0.35, (size * rng.uniform(1, 2), size), draw_seed(rng), 0.04, 0.5, 0.22
     )
 
@@ -55,7 +55,7 @@ def bricks(rng: np.random.Generator) -> Texture:
     """Brickwork, for paths and walls."""
     tone = vary_color(rng, ["#9a4f3a", "#b06a4a", "#a8805e", "#7d4338"])
     clay = Mottled(tone * 0.7, tone * 1.25, 5.0, draw_seed(rng), 2, 0.7)
-    return Tiles(clay, linear_color("#b8b0a4"), (0.46, 0.19), draw_seed(rng), 0.03, 0.5, 0.3)
+    return Tiling(clay, linear_color("#b8b0a4"), (0.46, 0.19), draw_seed(rng), 0.03, 0.5, 0.3)
 
 
 def floorboards(rng: np.random.Generator) -> Texture:
@@ -63,7 +63,7 @@ def floorboards(rng: np.random.Generator) -> Texture:
     tone = vary_color(rng, FLOOR_WOODS)
     grain = Mottled(tone * 0.6, tone * 1.3, 7.0, draw_seed(rng), 3, 0.8, stretch=(0.12, 1.0, 1.0))
     size = (rng.uniform(1.5, 2.5), rng.uniform(0.2, 0.4))
-    return Tiles(grain, tone * 0.25, size, draw_seed(rng), 0.02, 0.37, 0.3)
+    return Tiling(grain, tone * 0.25, size, draw_seed(rng), 0.02, 0.37, 0.3)
 
 
 def floor_tiles(rng: np.random.Generator) -> Texture:
@@ -72,7 +72,7 @@ def floor_tiles(rng: np.random.Generator) -> Texture:
     second = vary_color(rng, ["#4a4a4f", "#7c4a3a", "#48605a"]) if rng.random() < 0.5 else None
     inside = Mottled(tone * 0.8, tone, 2.5, draw_seed(rng), 3, 0.8)
     size = rng.uniform(0.4, 0.8)
-    return Tiles(inside, tone * 0.4, (size, size), draw_seed(rng), 0.03, 0.0, 0.1, second)
+    return Tiling(inside, tone * 0.4, (size, size), draw_seed(rng), 0.03, 0.0, 0.1, second)
 
 
 def carpet(rng: np.random.Generator) -> Texture:
@@ -86,7 +86,7 @@ def carpet(rng: np.random.Generator) -> Texture:
 def table_wood(rng: np.random.Generator) -> Texture:
     """A polished board of one or several planks."""
     tone = vary_color(rng, FLOOR_WOODS + WOODS[:2])
-    return Tiles(
+    return Tiling(
         Mottled(tone * 0.6, tone * 1.25, 6.0, draw_seed(rng), 3, 0.9, stretch=(0.13, 1.0, 1.0)),
         tone * 0.35,
         (9.0, rng.uniform(0.5, 1.2)),
@@ -105,7 +105,7 @@ def wide_ground(texture: Texture, half: Real, gloss: Real = 0.0) -> list[Part]:
 def table(rng: np.random.Generator, floor_height: Real) -> list[Part]:
     """A table under the object, tall as seen from an apple; its floor lies at `floor_height`."""
     texture = table_wood(rng) if rng.random() < 0.65 else carpet(rng)
-    material = Material(texture, gloss=0.08 if isinstance(texture, Tiles) else 0.0)
+    material = Material(texture, gloss=0.08 if isinstance(texture, Tiling) else 0.0)
     x, y = rng.uniform(2.3, 3.6), rng.uniform(2.3, 3.2)
     edge = Material(table_wood(rng))
     turn = rng.uniform(0, np.pi)

@@ -19,7 +19,7 @@ _BAND = 0.4
 
 
 @dataclass(frozen=True)
-class Surface:
+class LocalPoints:
     """Where rays hit one part, in the part's own coordinates."""
 
     points: Float[np.ndarray, "n 3"]
@@ -38,7 +38,7 @@ class Surface:
 class Texture(Protocol):
     """A colour for every point of a surface."""
 
-    def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
+    def __call__(self, surface: LocalPoints) -> Float[np.ndarray, "n 3"]:
         """Reflectance in linear light, 0 … 1."""
         ...
 
@@ -100,7 +100,7 @@ class Plain:
 
     color: Color
 
-    def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
+    def __call__(self, surface: LocalPoints) -> Float[np.ndarray, "n 3"]:
         """Reflectance in linear light."""
         return np.broadcast_to(self.color, surface.points.shape)
 
@@ -117,7 +117,7 @@ class Mottled:
     contrast: Real = 1.0
     stretch: tuple[Real, Real, Real] = (1.0, 1.0, 1.0)
 
-    def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
+    def __call__(self, surface: LocalPoints) -> Float[np.ndarray, "n 3"]:
         """Reflectance in linear light."""
         points = surface.points * np.array(self.stretch, np.float32)
         footprint = surface.footprint * np.float32(min(self.stretch))
@@ -133,7 +133,7 @@ class Wood:
     high: Color
     seed: int
 
-    def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
+    def __call__(self, surface: LocalPoints) -> Float[np.ndarray, "n 3"]:
         """Reflectance in linear light."""
         stretch = np.array([1, 1, 0.15], np.float32)
         points = surface.points * stretch + np.array([0.37, 0.21, 0.13], np.float32)
@@ -147,7 +147,7 @@ class Wood:
 
 
 @dataclass(frozen=True)
-class Tiles:
+class Tiling:
     """Rectangles with joints over the box sides: pavement, bricks, floorboards, window grids."""
 
     inside: Texture
@@ -162,7 +162,7 @@ class Tiles:
     second: Color | None = None
     """Every other tile in this colour, as on a chessboard."""
 
-    def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
+    def __call__(self, surface: LocalPoints) -> Float[np.ndarray, "n 3"]:
         """Reflectance in linear light."""
         x, y = surface.planar().T
         row = np.floor(y / self.size[1])
@@ -196,7 +196,7 @@ class Plaid:
     weft: Color
     period: Real
 
-    def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
+    def __call__(self, surface: LocalPoints) -> Float[np.ndarray, "n 3"]:
         """Reflectance in linear light."""
         x, y = surface.planar().T
         kept = np.clip(1.5 - 2 * surface.footprint / self.period, 0, 1)
@@ -222,7 +222,7 @@ class Worn:
     low_height: Real = 0.25
     """Height below which dirt gathers."""
 
-    def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
+    def __call__(self, surface: LocalPoints) -> Float[np.ndarray, "n 3"]:
         """Reflectance in linear light."""
         noise = fractal_noise(surface.points, surface.footprint, self.frequency, 3, self.seed)
         height = np.clip(1 - surface.points[:, 2] / self.low_height, 0, 1)

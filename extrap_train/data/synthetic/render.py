@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from extrap_train.data.synthetic.material import Surface, linear_to_srgb
+from extrap_train.data.synthetic.material import LocalPoints, linear_to_srgb
 from extrap_train.data.synthetic.noise import fractal_noise
 from extrap_train.data.synthetic.parts import Hits, Part, SyntheticScene
 from extrap_train.data.synthetic.vectors import dot, normalize, rotate
@@ -193,12 +193,12 @@ def _arrive(
     return _Lit(points, normals, to_eye, attributes[:, 3:], footprint)
 
 
-def _local_surface(part: Part, lit: _Lit) -> Surface:
+def _local_surface(part: Part, lit: _Lit) -> LocalPoints:
     """The hit points in the part's own coordinates."""
     scale = np.cbrt(np.linalg.det(part.part_to_world[:3, :3]))
     rotation = (part.part_to_world[:3, :3] / scale).astype(np.float32)
     shift = part.part_to_world[:3, 3].astype(np.float32)
-    return Surface(
+    return LocalPoints(
         rotate(lit.points - shift, rotation.T) / np.float32(scale),
         rotate(lit.normals, rotation.T),
         lit.footprint / np.float32(scale),
@@ -206,7 +206,7 @@ def _local_surface(part: Part, lit: _Lit) -> Surface:
 
 
 def _roughen(
-    part: Part, surface: Surface, normals: Float[np.ndarray, "n 3"]
+    part: Part, surface: LocalPoints, normals: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3"]:
     """Normals tilted by fine noise: fur, cast iron, bark."""
     material = part.material

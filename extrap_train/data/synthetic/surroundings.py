@@ -9,12 +9,12 @@ from extrap_train.data.synthetic import ground
 from extrap_train.data.synthetic.ground import draw_seed
 from extrap_train.data.synthetic.material import (
     Color,
+    LocalPoints,
     Material,
     Mottled,
     Plain,
-    Surface,
     Texture,
-    Tiles,
+    Tiling,
     linear_color,
     mix,
     vary_color,
@@ -45,7 +45,7 @@ class Sky:
     hills: Color
     seed: int
 
-    def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
+    def __call__(self, surface: LocalPoints) -> Float[np.ndarray, "n 3"]:
         """Radiance in linear light."""
         direction = surface.points / _SKY_RADIUS
         clouds = fractal_noise(direction, surface.footprint / _SKY_RADIUS, 3.0, 4, self.seed)
@@ -142,9 +142,9 @@ def _room(
         case 0:
             wall = ground.bricks(rng)
         case 1:
-            wall = Tiles(Plain(tone), tone * 0.7, (0.8, 40.0), draw_seed(rng), 0.3, shades=0.15)
+            wall = Tiling(Plain(tone), tone * 0.7, (0.8, 40.0), draw_seed(rng), 0.3, shades=0.15)
         case 2:
-            wall = Tiles(Plain(tone), tone * 0.6, (1.2, 1.2), draw_seed(rng), 0.06, shades=0.1)
+            wall = Tiling(Plain(tone), tone * 0.6, (1.2, 1.2), draw_seed(rng), 0.06, shades=0.1)
         case _:
             wall = Mottled(tone * 0.75, tone * 1.1, 1.2, draw_seed(rng), 4, 0.9)
     below = 0.5  # the box's own floor lies under the ground
@@ -170,7 +170,7 @@ def _hanging(rng: np.random.Generator, spot: Point, turn: Real) -> list[Part]:
     pane = rounded_box((width, 0.16, height))
     if rng.random() < 0.35:
         glass = linear_color("#dfeaf2")
-        texture: Texture = Tiles(
+        texture: Texture = Tiling(
             Plain(glass), linear_color("#8a8a86"), (width / 2, height / 2), 1, 0.07
         )
         material = Material(texture, glow=1)
@@ -222,7 +222,7 @@ def _crate(rng: np.random.Generator, spot: Point, turn: Real, scale: Real = 1.0)
     size = rng.uniform(0.4, 1.0, 3) * scale
     tone = vary_color(rng, _PAINTS)
     inside = Mottled(tone * 0.7, tone * 1.2, 5.0, draw_seed(rng), 2, stretch=(1, 1, 0.3))
-    texture = Tiles(inside, tone * 0.4, (0.9, rng.uniform(0.15, 0.5)), draw_seed(rng), 0.03)
+    texture = Tiling(inside, tone * 0.4, (0.9, rng.uniform(0.15, 0.5)), draw_seed(rng), 0.03)
     middle = (spot[0], spot[1], spot[2] + size[2] / 2)
     twist = turn + rng.uniform(-0.6, 0.6)
     return [_scenery(rounded_box(tuple(size), 0.03, 1), Material(texture), middle, twist)]
@@ -240,7 +240,7 @@ def _post(rng: np.random.Generator, spot: Point, turn: Real) -> list[Part]:
         ]
     )
     tone = vary_color(rng, _PAINTS)
-    texture = Tiles(Plain(tone), vary_color(rng, _PAINTS), (50.0, rng.uniform(0.4, 1.0)), 3, 0.15)
+    texture = Tiling(Plain(tone), vary_color(rng, _PAINTS), (50.0, rng.uniform(0.4, 1.0)), 3, 0.15)
     return [_scenery(lathe(profile, 14), Material(texture, 0.3), spot, turn)]
 
 
@@ -248,7 +248,9 @@ def _house(rng: np.random.Generator, spot: Point, turn: Real) -> list[Part]:
     size = (rng.uniform(3, 6), rng.uniform(2, 4), rng.uniform(2, 6))
     tone = vary_color(rng, ["#c9bfae", "#b08a6a", "#a9adb0", "#d3c48f", "#9a6a5a"])
     panes = Plain(vary_color(rng, ["#3a4a5a", "#55646e"]))
-    texture = Tiles(panes, tone, (rng.uniform(0.9, 1.4), rng.uniform(1.0, 1.5)), 5, 0.6, shades=0.4)
+    texture = Tiling(
+        panes, tone, (rng.uniform(0.9, 1.4), rng.uniform(1.0, 1.5)), 5, 0.6, shades=0.4
+    )
     middle = (spot[0], spot[1], size[2] / 2)
     return [_scenery(rounded_box(size), Material(texture), middle, turn)]
 
@@ -258,7 +260,7 @@ def _cabinet(rng: np.random.Generator, spot: Point, turn: Real, scale: Real = 1.
     tone = vary_color(rng, ground.WOODS + _PAINTS[4:6])
     grain = Mottled(tone * 0.65, tone * 1.25, 4.0, draw_seed(rng), 2, stretch=(0.2, 0.2, 1))
     cells = (size[0] / rng.integers(1, 4), size[2] / rng.integers(1, 5))
-    texture = Tiles(grain, tone * 0.3, cells, draw_seed(rng), 0.05, shades=0.2)
+    texture = Tiling(grain, tone * 0.3, cells, draw_seed(rng), 0.05, shades=0.2)
     middle = (spot[0], spot[1], spot[2] + size[2] / 2)
     return [_scenery(rounded_box(size, 0.02, 1), Material(texture, 0.1), middle, turn)]
 

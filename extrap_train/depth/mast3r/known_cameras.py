@@ -9,12 +9,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrap_train.depth import DepthMap
-from extrap_train.depth.mast3r.point_map_network import Prediction
+from extrap_train.depth.mast3r.point_map_network import PredictedPoints
 from extrap_train.geometry.cameras import pixel_grid, transform
 from extrap_train.views import Camera
 
 SAMPLES = 4000
-"""Pixels that vote for the second camera: the surest half, thinned out evenly."""
+"""Pixels that vote for the second camera: the more certain half, thinned out evenly."""
 TOLERANCE = 0.01
 """Reprojection error of an inlier, as a share of the picture's longer side."""
 MIN_INLIERS = 0.2
@@ -26,7 +26,7 @@ LARGEST_CONTRADICTION_RAD = math.radians(20)
 
 
 def posed_depths(
-    first: Prediction, second: Prediction, first_camera: Camera, second_camera: Camera
+    first: PredictedPoints, second: PredictedPoints, first_camera: Camera, second_camera: Camera
 ) -> tuple[DepthMap, DepthMap] | None:
     """Both views' depth in scene units, from a pair's points in the network's own unit.
 
@@ -55,8 +55,8 @@ def predicted_pose(
     """From the points' frame to the frame of the camera with `camera`'s intrinsics that sees each
     of them at its pixel; double precision, None where no camera does."""
     pixels = pixel_grid(camera.height, camera.width).reshape(-1, 2)
-    surest = sureness.flatten().argsort(descending=True, stable=True)
-    votes = surest[: max(len(surest) // 2, 4)]
+    ranked = sureness.flatten().argsort(descending=True, stable=True)
+    votes = ranked[: max(len(ranked) // 2, 4)]
     votes = votes[:: max(len(votes) // SAMPLES, 1)]
     objects = points.reshape(-1, 3)[votes].double().numpy()
     seen = pixels[votes].double().numpy()

@@ -45,7 +45,7 @@ class Encoding:
 
 
 @dataclass(frozen=True)
-class Prediction:
+class PredictedPoints:
     """What the network says of one picture of a pair, in the *first* camera's frame; its scale is
     the network's own."""
 
@@ -93,7 +93,7 @@ class PointMapNetwork(nn.Module):
             tokens = block(tokens, positions)
         return Encoding(self.enc_norm(tokens), grid)
 
-    def decode(self, first: Encoding, second: Encoding) -> tuple[Prediction, Prediction]:
+    def decode(self, first: Encoding, second: Encoding) -> tuple[PredictedPoints, PredictedPoints]:
         """Both pictures' points in the first camera's frame."""
         here = token_positions(*first.grid, device=first.tokens.device)
         there = token_positions(*second.grid, device=second.tokens.device)
@@ -111,7 +111,7 @@ class PointMapNetwork(nn.Module):
 
     def forward(
         self, first: Float[Tensor, "b 3 h w"], second: Float[Tensor, "b 3 h2 w2"]
-    ) -> tuple[Prediction, Prediction]:
+    ) -> tuple[PredictedPoints, PredictedPoints]:
         """`encode` and `decode` of one pair."""
         return self.decode(self.encode(first), self.encode(second))
 
@@ -122,9 +122,9 @@ def _head(a: Architecture) -> nn.Module:
     return DensePointHead(a.encoder_width, a.decoder_width, a.patch, a.descriptor_width)
 
 
-def _activate(raw: Float[Tensor, "b 4 h w"]) -> Prediction:
+def _activate(raw: Float[Tensor, "b 4 h w"]) -> PredictedPoints:
     """Points leave the origin exponentially; the confidence is an exponential, too."""
     values = raw.permute(0, 2, 3, 1)
     points, confidence = values[..., : POINT_CHANNELS - 1], 1 + values[..., -1].exp()
     distance = points.norm(dim=-1, keepdim=True)
-    return Prediction(points / distance.clamp_min(1e-8) * distance.expm1(), confidence)
+    return PredictedPoints(points / distance.clamp_min(1e-8) * distance.expm1(), confidence)

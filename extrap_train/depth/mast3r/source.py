@@ -22,7 +22,7 @@ SAME_DEPTH = math.log(1.05)
 
 
 @dataclass(frozen=True)
-class Fit:
+class Crop:
     """How a view becomes the network's: resampled, then cropped around its middle."""
 
     resized: tuple[int, int]
@@ -52,14 +52,14 @@ class _Prepared:
     """A view as the network sees it, with the way back."""
 
     view: View
-    fit: Fit
+    crop: Crop
     camera: Camera
     """Camera of the picture that the network sees."""
     encoding: Encoding
 
     def undone(self, depth_map: DepthMap) -> DepthMap:
         """Depth of what the network sees as depth of the view, where the view's picture lies."""
-        back = self.fit.undo(depth_map, self.view.camera.height, self.view.camera.width)
+        back = self.crop.undo(depth_map, self.view.camera.height, self.view.camera.width)
         return combine([back], lambda tensors: tensors[0].to(self.view.image))
 
 
@@ -153,10 +153,10 @@ class Mast3rDepth:
     @torch.no_grad()
     def _prepare(self, view: View) -> _Prepared:
         patch, device = self.network.architecture.patch, self.network.mask_token.device
-        how = fit(view, self.config.image_size, patch, self.config.square)
-        small = how.apply(view)
+        crop = crop_for(view, self.config.image_size, patch, self.config.square)
+        small = crop.apply(view)
         encoding = self.network.encode(network_input(small, device))
-        return _Prepared(view, how, small.camera, encoding)
+        return _Prepared(view, crop, small.camera, encoding)
 
     @torch.no_grad()
     def _pair(self, first: _Prepared, second: _Prepared) -> tuple[DepthMap, DepthMap] | None:
@@ -192,7 +192,7 @@ def weighted_median(
     return values.gather(0, order).gather(0, middle)[0]
 
 
-def fit(view: View, image_size: int, patch: int, square: bool) -> Fit:
+def crop_for(view: View, image_size: int, patch: int, square: bool) -> Crop:
     """The longer side becomes `image_size`, both are cut to multiples of `patch`.
 
     Unless `square`, a square picture is cut to 4:3, the squarest shape that the published networks
@@ -208,7 +208,7 @@ def fit(view: View, image_size: int, patch: int, square: bool) -> Fit:
             f"{view.name or 'a view'}: {view.camera.height} x {view.camera.width} pixels are too "
             f"narrow for depth.image_size={image_size}, at which a side has under {patch}"
         )
-    return Fit(resized, (resized[0] - height) // 2, (resized[1] - width) // 2, height, width)
+    return Crop(resized, (resized[0] - height) // 2, (resized[1] - width) // 2, height, width)
 
 
 def network_input(view: View, device: torch.device) -> Float[Tensor, "1 3 h w"]:

@@ -17,7 +17,7 @@ from extrap_train.reconstruction.depth_prediction.observation import CERTAIN, CH
 BINS = 10
 _FACTORS = 2.0 ** torch.arange(-2, 3.01, 0.25)
 _ON_OBJECT = 4.0
-"""Examples weigh more where the object is not certain (`examples.with_truth`)."""
+"""Examples weigh more where the object is not certain (`depth_examples.with_truth`)."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from extrap_train.diffusion.averaging import AveragedModule
 from extrap_train.diffusion.checkpoints import WholeCheckpointIO, find_damage
 from extrap_train.diffusion.training import rate_at
 from extrap_train.errors import InputError
-from extrap_train.reconstruction.depth_prediction.examples import DepthExamples
+from extrap_train.reconstruction.depth_prediction.depth_examples import DepthExamples
 from extrap_train.reconstruction.depth_prediction.network import WIDTHS, DepthMixture, DepthNetwork
 from extrap_train.reconstruction.depth_prediction.observation import CHANNELS
 from extrap_train.store.atomic import atomic_file, save_array

@@ -10,7 +10,7 @@ from extrap_train.depth.mast3r.point_map_network import (
     Architecture,
     Encoding,
     PointMapNetwork,
-    Prediction,
+    PredictedPoints,
 )
 from extrap_train.geometry.cameras import transform, unproject
 from extrap_train.views import Camera, View
@@ -18,14 +18,14 @@ from extrap_train.views import Camera, View
 
 def exact_pair(
     scene: Sequence[Surface], first: Camera, second: Camera, unit: float
-) -> tuple[Prediction, Prediction]:
+) -> tuple[PredictedPoints, PredictedPoints]:
     """What a perfect network says: both views' points in the first camera's frame."""
     maps = []
     for camera in (first, second):
         points = unproject(render(list(scene), camera).depth, camera)
         to_first = first.world_to_cam @ camera.cam_to_world
         moved = transform(to_first, points.flatten(0, 1)).view_as(points) / unit
-        maps.append(Prediction(moved[None], torch.full(moved.shape[:2], 5.0)[None]))
+        maps.append(PredictedPoints(moved[None], torch.full(moved.shape[:2], 5.0)[None]))
     return maps[0], maps[1]
 
 
@@ -43,7 +43,7 @@ class Oracle(PointMapNetwork):
         self.encoded += 1
         return Encoding(images.flatten(2), (images.shape[-2] // 16, images.shape[-1] // 16))
 
-    def decode(self, first: Encoding, second: Encoding) -> tuple[Prediction, Prediction]:
+    def decode(self, first: Encoding, second: Encoding) -> tuple[PredictedPoints, PredictedPoints]:
         cameras = [self._camera(encoding) for encoding in (first, second)]
         return exact_pair(self.scene, *cameras, self.unit)
 

@@ -6,7 +6,7 @@ from oracle import exact_pair
 from traced_scenes import SCENES, orbit_camera, render
 
 from extrap_train.depth.mast3r.known_cameras import pair_scale, posed_depths, predicted_pose
-from extrap_train.depth.mast3r.point_map_network import Prediction
+from extrap_train.depth.mast3r.point_map_network import PredictedPoints
 
 SCENE = SCENES["box on the ground"]
 FIRST, SECOND = orbit_camera(0, 64), orbit_camera(25, 64)
@@ -37,7 +37,7 @@ def test_noise_and_gross_errors_in_a_third_of_the_points_change_little():
     generator = torch.Generator().manual_seed(0)
     first, second = exact_pair(SCENE, FIRST, SECOND, 2.0)
 
-    def spoilt(prediction: Prediction) -> Prediction:
+    def spoilt(prediction: PredictedPoints) -> PredictedPoints:
         points = prediction.points
         points = points * (1 + 0.01 * torch.randn(points.shape, generator=generator))
         wild = torch.rand(points.shape[:-1], generator=generator) < 0.3

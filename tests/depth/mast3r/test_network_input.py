@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from extrap_train.depth import DepthMap
-from extrap_train.depth.mast3r.source import fit, network_input
+from extrap_train.depth.mast3r.source import crop_for, network_input
 from extrap_train.errors import InputError
 from extrap_train.geometry.cameras import pixel_grid, project, unproject_to_world
 from extrap_train.views import Camera, View
@@ -28,7 +28,7 @@ def ramp(height: int, width: int) -> View:
     ],
 )
 def test_sizes_are_multiples_of_the_patch(size, square, expected):
-    view = fit(ramp(*size), 512, 16, square).apply(ramp(*size))
+    view = crop_for(ramp(*size), 512, 16, square).apply(ramp(*size))
     assert (view.camera.height, view.camera.width) == expected
     assert view.image.shape[1:] == expected
 
@@ -36,7 +36,7 @@ def test_sizes_are_multiples_of_the_patch(size, square, expected):
 @pytest.mark.parametrize("size", [(300, 400), (470, 300), (310, 310)])
 def test_intrinsics_follow_resampling_and_crop(size):
     view = ramp(*size)
-    small = fit(view, 128, 16, False).apply(view)
+    small = crop_for(view, 128, 16, False).apply(view)
     # A point of the world is seen at the pixel of either picture that shows the same colour.
     points = unproject_to_world(
         torch.full((small.camera.height, small.camera.width), 2.0), small.camera
@@ -51,11 +51,11 @@ def test_intrinsics_follow_resampling_and_crop(size):
 
 def test_depth_returns_to_its_pixels_and_is_unknown_outside_the_crop():
     view = ramp(310, 310)
-    how = fit(view, 128, 16, False)
+    crop = crop_for(view, 128, 16, False)
     truth = 2 + view.image[0] + view.image[1]
-    small = how.apply(View(view.image, view.camera, truth))
+    small = crop.apply(View(view.image, view.camera, truth))
     depth = 2 + small.image[0] + small.image[1]
-    back = how.undo(DepthMap(depth, torch.ones_like(depth)), 310, 310)
+    back = crop.undo(DepthMap(depth, torch.ones_like(depth)), 310, 310)
     known = back.confidence > 0
     assert 0.7 < known.float().mean() < 0.8  # three quarters
     assert not known[:30].any()
@@ -73,4 +73,4 @@ def test_colours_are_centred():
 
 def test_a_sliver_is_refused_by_name():
     with pytest.raises(InputError, match=r"frame7\.jpg: 4 x 400 pixels are too narrow"):
-        fit(ramp(4, 400), 512, 16, False)
+        crop_for(ramp(4, 400), 512, 16, False)

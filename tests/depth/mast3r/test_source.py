@@ -9,7 +9,7 @@ from traced_scenes import SCENES, orbit_camera, render
 
 from extrap_train.config import Mast3rConfig
 from extrap_train.depth import DepthSource
-from extrap_train.depth.mast3r.source import Mast3rDepth, fit, fuse_depth_maps
+from extrap_train.depth.mast3r.source import Mast3rDepth, crop_for, fuse_depth_maps
 from extrap_train.depth.sources import depth_source
 from extrap_train.errors import InputError
 from extrap_train.geometry.cameras import transform, unproject_to_world
@@ -21,7 +21,7 @@ CONFIG = Mast3rConfig(image_size=64, neighbours=2)
 def source_and_views(*azimuths_deg: float):
     """Square views of 80², of which the network sees 48 × 64."""
     views = [render(SCENE, orbit_camera(azimuth_deg, 80)) for azimuth_deg in azimuths_deg]
-    seen = [fit(view, 64, 16, False).apply(view) for view in views]
+    seen = [crop_for(view, 64, 16, False).apply(view) for view in views]
     return Mast3rDepth(CONFIG, Oracle(SCENE, 7.0, seen)), views
 
 

@@ -8,9 +8,9 @@ from jaxtyping import Float
 from extrap_train.data.synthetic.ground import draw_seed
 from extrap_train.data.synthetic.material import (
     Color,
+    LocalPoints,
     Material,
     Mottled,
-    Surface,
     linear_color,
     mix,
     vary_color,
@@ -36,7 +36,7 @@ class AppleSkin:
     dots: float
     seed: int
 
-    def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
+    def __call__(self, surface: LocalPoints) -> Float[np.ndarray, "n 3"]:
         """Reflectance in linear light."""
         points, footprint = surface.points, surface.footprint
         radius = np.hypot(points[:, 0], points[:, 1]) + 1e-4

@@ -8,9 +8,9 @@ from jaxtyping import Float
 from extrap_train.data.synthetic.ground import draw_seed
 from extrap_train.data.synthetic.material import (
     Color,
+    LocalPoints,
     Material,
     Numbers,
-    Surface,
     mix,
     step,
     vary_color,
@@ -40,7 +40,7 @@ class Cover:
     border: bool
     seed: int
 
-    def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
+    def __call__(self, surface: LocalPoints) -> Float[np.ndarray, "n 3"]:
         """Reflectance in linear light."""
         x, y, _ = surface.points.T
         width, height = self.size
@@ -80,7 +80,7 @@ class Spine:
     length: Real
     seed: int
 
-    def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
+    def __call__(self, surface: LocalPoints) -> Float[np.ndarray, "n 3"]:
         """Reflectance in linear light."""
         v = surface.points[:, 1] / self.length
         w = surface.points[:, 2]
@@ -98,7 +98,7 @@ class Pages:
 
     paper: Color
 
-    def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
+    def __call__(self, surface: LocalPoints) -> Float[np.ndarray, "n 3"]:
         """Reflectance in linear light."""
         layered = surface.points * np.array([1.5, 1.5, 40], np.float32)
         lines = fractal_noise(layered, surface.footprint * 10, 1.0, 2, 11)

@@ -9,11 +9,11 @@ from jaxtyping import Float
 from extrap_train.data.synthetic.ground import draw_seed
 from extrap_train.data.synthetic.material import (
     Color,
+    LocalPoints,
     Material,
     Mottled,
     Numbers,
     Plain,
-    Surface,
     linear_color,
     mix,
     step,
@@ -60,7 +60,7 @@ class Glaze:
     high: Real
     radius: Real
 
-    def __call__(self, surface: Surface) -> Float[np.ndarray, "n 3"]:
+    def __call__(self, surface: LocalPoints) -> Float[np.ndarray, "n 3"]:
         """Reflectance in linear light."""
         x, y, z = surface.points.T
         blur, zone = surface.footprint, self.high - self.low
