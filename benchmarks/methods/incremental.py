@@ -38,21 +38,21 @@ class IncrementalDiffusion(Diffusion):
         world = fit_world_frame(stack_cameras([view.camera for view in inputs.fine_views]))
         size = model.config.warp_size
         views, confidences = first_views(inputs.fine_views, inputs.depth_source, world, size)
-        known = map_of_inputs(views, confidences, options.tolerance)
+        scene_map = map_of_inputs(views, confidences, options.tolerance)
         generator = _Remembering(self.generator(model))
         pipeline = CompletionPipeline(generator, depth_source(StereoConfig()), options, inputs.seed)
         cameras = world.inside(inputs.targets.squared(size))
         names = target_names(inputs)
         queries = [Query(name, cameras[index]) for index, name in enumerate(names)]
         steps: list[Step] = []
-        known = complete(known, queries, pipeline, lambda _, __, step: steps.append(step))
+        scene_map = complete(scene_map, queries, pipeline, lambda _, __, step: steps.append(step))
         # For every view, the attempt that the map kept, as it was generated.
-        seeds = {v.view.name: v.origin.seed for v in known.views if v.origin.kind == GENERATED}
+        seeds = {v.view.name: v.origin.seed for v in scene_map.views if v.origin.kind == GENERATED}
         agreeing = [s for s in steps if s.agreement >= options.confidence.least_agreement]
         return Synthesis(
             images=torch.stack([generator.pictures[name, seeds[name]] for name in names]),
             given={"references": "inputs and generated views", "generated views' depth": "stereo"},
-            points=_points(known, world, options),
+            points=_points(scene_map, world, options),
             counts={
                 "pictures": float(sum(step.attempts for step in steps)),
                 "agreeing_views": float(len(agreeing)),
@@ -89,9 +89,11 @@ class _Remembering:
         return made
 
 
-def _points(known: GlobalMap, world: WorldFrame, options: CompletionConfig) -> Float[Tensor, "m 3"]:
+def _points(
+    scene_map: GlobalMap, world: WorldFrame, options: CompletionConfig
+) -> Float[Tensor, "m 3"]:
     """The map's points that are sure enough, in the photographs' world."""
-    cloud = cloud_of(fuse_depths(known), votes=options.confidence.votes)
+    cloud = cloud_of(fuse_depths(scene_map), votes=options.confidence.votes)
     return world.points_outside(
         cloud[cloud.confidence >= options.confidence.least_confidence].points
     )

@@ -113,7 +113,8 @@ def make_frames(
 def select_input_frames(
     sequence: FrameSequence, names: Sequence[str], count: int | None
 ) -> list[int]:
-    """Indices of a scene's input frames, in their order.
+    """Indices of a scene's input frames, in their order, for all tasks but `task=complete`, which
+    has `reconstruction.inputs.choose_frames`.
 
     The frames that are named; else `count` spread by farthest point sampling of the positions; else
     all. Raises InputError where there are fewer.

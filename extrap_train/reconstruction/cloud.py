@@ -37,7 +37,7 @@ class PointCloud:
         return combine([self], lambda tensors: tensors[0][chosen])
 
 
-def cloud_of(known: GlobalMap, *, votes: bool = True, subdivide: int = 1) -> PointCloud:
+def cloud_of(scene_map: GlobalMap, *, votes: bool = True, subdivide: int = 1) -> PointCloud:
     """All points that the views added, surfaces cut into `subdivide`² points a pixel.
 
     With `votes`, points that more certain views have looked through are left out, and the
@@ -45,20 +45,20 @@ def cloud_of(known: GlobalMap, *, votes: bool = True, subdivide: int = 1) -> Poi
     that agrees.
     """
     return combine(
-        [_points_of(known, index, votes, subdivide) for index in range(len(known))],
+        [_points_of(scene_map, index, votes, subdivide) for index in range(len(scene_map))],
         torch.cat,
     )
 
 
-def _points_of(known: GlobalMap, index: int, votes: bool, subdivide: int) -> PointCloud:
+def _points_of(scene_map: GlobalMap, index: int, votes: bool, subdivide: int) -> PointCloud:
     """A view's fresh points; those at occlusion edges, on no surface, are left out."""
-    view = known.views[index]
+    view = scene_map.views[index]
     normals, on_surface = normals_from_depth(view.depth, view.camera)
     points = unproject_to_world(view.depth, view.camera)
     confidence = view.confidence
     sound = on_surface  # a few surfaces have no normal
     if votes:
-        confidence, share = _count_votes(known, index, points.flatten(0, 1))
+        confidence, share = _count_votes(scene_map, index, points.flatten(0, 1))
         confidence, share = confidence.view_as(sound), share.view_as(sound)
         sound = sound & (share >= 0.5)
         confidence = confidence * share
@@ -77,16 +77,16 @@ def _points_of(known: GlobalMap, index: int, votes: bool, subdivide: int) -> Poi
 
 
 def _count_votes(
-    known: GlobalMap, index: int, points: Float[Tensor, "n 3"]
+    scene_map: GlobalMap, index: int, points: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
     """Confidence of the most certain view of each point; share of the votes that confirm it."""
-    own = known.views[index].confidence.flatten()
+    own = scene_map.views[index].confidence.flatten()
     highest, confirmed, contradicted = own, own, torch.zeros_like(own)
-    for other_index in known.nearest(known.views[index].camera, MAX_COMPARED + 1):
+    for other_index in scene_map.nearest(scene_map.views[index].camera, MAX_COMPARED + 1):
         if other_index == index:
             continue
-        other = known.views[other_index]
-        said = look_up(points, other.depth, other.camera, 2 * known.tolerance)
+        other = scene_map.views[other_index]
+        said = look_up(points, other.depth, other.camera, 2 * scene_map.tolerance)
         confidence = other.confidence.flatten()[said.pixel]
         agrees = torch.where(said.sight == Sight.AGREES, confidence, 0)
         highest, confirmed = torch.maximum(highest, agrees), confirmed + agrees

@@ -15,7 +15,7 @@ from extrap_train.geometry.orbits import fit_circle
 from extrap_train.geometry.viewpoints import camera_centers, scene_center
 from extrap_train.geometry.warp import splat_points
 from extrap_train.reconstruction.cloud import PointCloud
-from extrap_train.reconstruction.global_map import GIVEN, GlobalMap
+from extrap_train.reconstruction.global_map import GlobalMap
 from extrap_train.reconstruction.planner import Query, circle_cameras
 from extrap_train.views import Camera, stack_cameras
 
@@ -30,13 +30,13 @@ distance: they would hide the object.
 """
 
 
-def draw_growth(known: GlobalMap, cloud: PointCloud, path: Path) -> None:
+def draw_growth(scene_map: GlobalMap, cloud: PointCloud, path: Path) -> None:
     """A strip of the cloud after the inputs and after more and more views, from both sides: close,
     and from where the whole cloud at the end fits into the picture.
     """
-    given = sum(view.origin.kind == GIVEN for view in known.views)
-    stages = sorted({round(n) for n in np.linspace(given, len(known), STAGES)})
-    close = _turn(known, 2)
+    given = len(scene_map.given)
+    stages = sorted({round(n) for n in np.linspace(given, len(scene_map), STAGES)})
+    close = _turn(scene_map, 2)
     far = framed(close, cloud)
     columns = {}
     for count in stages:
@@ -48,9 +48,9 @@ def draw_growth(known: GlobalMap, cloud: PointCloud, path: Path) -> None:
     draw_contact_sheet(columns, path)
 
 
-def draw_turntable(known: GlobalMap, cloud: PointCloud, path: Path) -> None:
+def draw_turntable(scene_map: GlobalMap, cloud: PointCloud, path: Path) -> None:
     """A film around the whole cloud."""
-    cameras = _turn(known, TURN_FRAMES)
+    cameras = _turn(scene_map, TURN_FRAMES)
     write_film(_draw_cloud(_select_near(cloud, cameras), cameras), path)
 
 
@@ -75,13 +75,13 @@ def framed(cameras: Camera, cloud: PointCloud) -> Camera:
     return replace(cameras, world_to_cam=moved)
 
 
-def draw_plan(known: GlobalMap, queries: Sequence[Query], path: Path) -> None:
+def draw_plan(scene_map: GlobalMap, queries: Sequence[Query], path: Path) -> None:
     """Inputs and queries seen from above, numbered in the order in which they are planned."""
-    circle = fit_circle(known.cameras)
+    circle = fit_circle(scene_map.cameras)
     north = np.cross(circle.axis, circle.east)
     figure, axes = plt.subplots(figsize=(5, 5), layout="constrained")
     planned = stack_cameras([query.camera for query in queries]) if queries else None
-    for cameras, colour, label in ((known.cameras, "C0", "given"), (planned, "C1", "planned")):
+    for cameras, colour, label in ((scene_map.cameras, "C0", "given"), (planned, "C1", "planned")):
         if cameras is None:
             continue
         offsets = camera_centers(cameras) - circle.center
@@ -100,9 +100,9 @@ def draw_plan(known: GlobalMap, queries: Sequence[Query], path: Path) -> None:
     save_figure(figure, path)
 
 
-def _turn(known: GlobalMap, count: int) -> Camera:
+def _turn(scene_map: GlobalMap, count: int) -> Camera:
     """Cameras around the scene at the inputs' mean height, the first where the inputs are."""
-    given = stack_cameras([v.camera for v in known.views if v.origin.kind == GIVEN])
+    given = stack_cameras([view.camera for view in scene_map.given])
     middle = camera_centers(given).mean(0)
     return circle_cameras(given, middle, count).resized(PICTURE_SIZE, PICTURE_SIZE)
 

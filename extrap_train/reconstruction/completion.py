@@ -59,34 +59,34 @@ def map_of_inputs(
     views: Sequence[View], confidences: Sequence[torch.Tensor], tolerance: float
 ) -> GlobalMap:
     """The map of the given views; each must have a depth, and they are the roots of all others."""
-    known = GlobalMap(tolerance)
+    scene_map = GlobalMap(tolerance)
     for index, (view, confidence) in enumerate(zip(views, confidences, strict=True)):
-        known, _ = known.added(view, confidence, Origin(GIVEN, root=index))
-    return known
+        scene_map, _ = scene_map.added(view, confidence, Origin(GIVEN, root=index))
+    return scene_map
 
 
 def complete(
-    known: GlobalMap,
+    scene_map: GlobalMap,
     queries: Sequence[Query],
     pipeline: CompletionPipeline,
     on_step: Callable[[GlobalMap, MapView, Step], None],
 ) -> GlobalMap:
     """Add every query that the map does not have yet; `on_step` is called after each."""
-    done = {view.view.name for view in known.views}
+    done = {view.view.name for view in scene_map.views}
     left = [query for query in queries if query.name not in done]
     while left:
         started = time.perf_counter()
-        query = next_query(known, left)
+        query = next_query(scene_map, left)
         planned = time.perf_counter() - started
         left = [other for other in left if other.name != query.name]
-        known, added, step = add_view(known, query, pipeline)
+        scene_map, added, step = add_view(scene_map, query, pipeline)
         step.seconds["plan"] = planned
-        on_step(known, added, step)
-    return known
+        on_step(scene_map, added, step)
+    return scene_map
 
 
 def add_view(
-    known: GlobalMap, query: Query, pipeline: CompletionPipeline
+    scene_map: GlobalMap, query: Query, pipeline: CompletionPipeline
 ) -> tuple[GlobalMap, MapView, Step]:
     """Generate one view and merge it into the map.
 
@@ -94,19 +94,19 @@ def add_view(
     """
     options, clock = pipeline.options, _Clock()
     only_photographs = options.references == "photographs"
-    references = known.nearest(query.camera, REFERENCES, photographs=only_photographs)
-    neighbours = known.nearest(query.camera, options.edges)
+    references = scene_map.nearest(query.camera, REFERENCES, photographs=only_photographs)
+    neighbours = scene_map.nearest(query.camera, options.edges)
     tries = options.confidence.attempts if options.confidence.regenerate else 1
     best: tuple[Proposal, int] | None = None
     attempts = 0
     for seed in range(pipeline.seed, pipeline.seed + tries):
-        picture = _generate_picture(known, query, references, pipeline.generator, seed)
+        picture = _generate_picture(scene_map, query, references, pipeline.generator, seed)
         clock.took("generate")
         if pipeline.predictor is None:
-            proposal = propose(known, picture, neighbours, pipeline.source, options.confidence)
+            proposal = propose(scene_map, picture, neighbours, pipeline.source, options.confidence)
         else:
             proposal = propose_predicted(
-                known, picture, neighbours, pipeline.predictor, options.confidence
+                scene_map, picture, neighbours, pipeline.predictor, options.confidence
             )
         clock.took("align")
         attempts += 1
@@ -118,13 +118,13 @@ def add_view(
     proposal, seed = best
     origin = Origin(
         GENERATED,
-        root=known.views[references[0]].origin.root,
+        root=scene_map.views[references[0]].origin.root,
         references=tuple(references),
         seed=seed,
         agreement=proposal.agreement,
     )
-    drift = loop_error(known, query.camera, neighbours)
-    known, added = known.added(proposal.view, proposal.confidence, origin)
+    drift = loop_error(scene_map, query.camera, neighbours)
+    scene_map, added = scene_map.added(proposal.view, proposal.confidence, origin)
     clock.took("merge")
     step = Step(
         name=query.name,
@@ -135,10 +135,10 @@ def add_view(
         loop_error=drift,
         seconds=clock.seconds,
     )
-    return known, added, step
+    return scene_map, added, step
 
 
-def loop_error(known: GlobalMap, camera: Camera, neighbours: Sequence[int]) -> float | None:
+def loop_error(scene_map: GlobalMap, camera: Camera, neighbours: Sequence[int]) -> float | None:
     """The drift where a loop closes: how far apart two branches see the same pixels of a camera.
 
     A branch is all generated views whose chains of references begin at the same input. The median
@@ -147,11 +147,11 @@ def loop_error(known: GlobalMap, camera: Camera, neighbours: Sequence[int]) -> f
     """
     branches: dict[int, list[int]] = {}
     for index in neighbours:
-        if known.views[index].origin.kind == GENERATED:
-            branches.setdefault(known.views[index].origin.root, []).append(index)
+        if scene_map.views[index].origin.kind == GENERATED:
+            branches.setdefault(scene_map.views[index].origin.root, []).append(index)
     if len(branches) < 2:
         return None
-    one, other = (prior_of(known, camera, indices) for indices in list(branches.values())[:2])
+    one, other = (prior_of(scene_map, camera, indices) for indices in list(branches.values())[:2])
     both = one.mask & other.mask
     if int(both.sum()) < MIN_OVERLAP:
         return None
@@ -160,7 +160,7 @@ def loop_error(known: GlobalMap, camera: Camera, neighbours: Sequence[int]) -> f
 
 
 def _generate_picture(
-    known: GlobalMap,
+    scene_map: GlobalMap,
     query: Query,
     references: Sequence[int],
     generator: ViewGenerator,
@@ -169,7 +169,7 @@ def _generate_picture(
     """The query's picture at the map's size, as an 8-bit file would keep it, so that a resumed run
     sees the same.
     """
-    views = [known.views[index].view for index in references]
+    views = [scene_map.views[index].view for index in references]
     made = generator.generate(views, stack_cameras([query.camera]), [query.name], seed)
     size = (query.camera.height, query.camera.width)
     image = made.images

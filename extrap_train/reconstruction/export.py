@@ -37,13 +37,13 @@ def write_cloud(cloud: PointCloud, path: Path) -> None:
     write_atomic(path, content.getvalue())
 
 
-def write_views(known: GlobalMap, world: WorldFrame, folder: Path) -> None:
+def write_views(scene_map: GlobalMap, world: WorldFrame, folder: Path) -> None:
     """Write every view's picture, depth and confidence under `views/`, and `transforms.json`.
 
     Depth is in units of `DEPTH_UNIT`.
     """
     entries = []
-    for stem, view in zip(_stems(known), known.views, strict=True):
+    for stem, view in zip(_stems(scene_map), scene_map.views, strict=True):
         save_picture(view.view.image, folder / "views" / f"{stem}.png")
         _write_array(view.depth * world.unit / DEPTH_UNIT, folder / "views" / f"{stem}.depth.npy")
         _write_array(view.confidence, folder / "views" / f"{stem}.confidence.npy")
@@ -52,13 +52,13 @@ def write_views(known: GlobalMap, world: WorldFrame, folder: Path) -> None:
     write_atomic(folder / "transforms.json", (json.dumps(content, indent=1) + "\n").encode())
 
 
-def write_colmap(known: GlobalMap, world: WorldFrame, cloud: PointCloud, folder: Path) -> None:
+def write_colmap(scene_map: GlobalMap, world: WorldFrame, cloud: PointCloud, folder: Path) -> None:
     """Write a COLMAP text model to `colmap/sparse/0`, with `colmap/images` leading to `views/`.
 
     `cloud` is in the photographs' world; its points have no tracks.
     """
     cameras, images = [], []
-    for number, (stem, view) in enumerate(zip(_stems(known), known.views, strict=True), 1):
+    for number, (stem, view) in enumerate(zip(_stems(scene_map), scene_map.views, strict=True), 1):
         camera = world.outside(view.camera)
         k = camera.intrinsics.double()
         lens = " ".join(repr(float(x)) for x in (k[0, 0], k[1, 1], k[0, 2], k[1, 2]))
@@ -84,9 +84,9 @@ def _point_lines(cloud: PointCloud, chosen: Sequence[int]) -> list[str]:
     ]
 
 
-def _stems(known: GlobalMap) -> list[str]:
+def _stems(scene_map: GlobalMap) -> list[str]:
     """File names without suffix or white space, at which COLMAP would end a name."""
-    names = picture_names([view.view.name for view in known.views])
+    names = picture_names([view.view.name for view in scene_map.views])
     return [f"{number:03d}_{name}" for number, name in enumerate(names)]
 
 

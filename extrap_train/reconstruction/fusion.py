@@ -23,29 +23,29 @@ _REACH = 3 * _TRUNCATION
 _SAMPLES = 25
 
 
-def fuse_depths(known: GlobalMap) -> GlobalMap:
+def fuse_depths(scene_map: GlobalMap) -> GlobalMap:
     """The map with the generated views' depths fused; what the photographs show stays.
 
     A surface that the others contradict, so that no place for it is left within reach of its own,
     loses its confidence.
     """
-    fused = GlobalMap(known.tolerance)
-    for view in known.views:
+    fused = GlobalMap(scene_map.tolerance)
+    for view in scene_map.views:
         depth, confidence = view.depth, view.confidence
         if view.origin.kind != GIVEN:
-            depth, confidence = _fuse(view, known)
+            depth, confidence = _fuse(view, scene_map)
         fused, _ = fused.added(replace(view.view, depth=depth), confidence, view.origin)
     return fused
 
 
-def _fuse(view: MapView, known: GlobalMap) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+def _fuse(view: MapView, scene_map: GlobalMap) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
     """One view's depth, and its confidence: 0 where no surface is left."""
     shifts = torch.linspace(-_REACH, _REACH, _SAMPLES, dtype=view.depth.dtype)
     depths = view.depth * (1 + shifts[:, None, None])
     points = unproject_to_world(depths, stack_cameras([view.camera] * _SAMPLES)).flatten(0, 2)
     total, weights = torch.zeros_like(points[:, 0]), torch.zeros_like(points[:, 0])
-    for index in known.nearest(view.camera, MAX_COMPARED):  # itself the first of them
-        distance, weight = signed_distance(points, known.views[index], _TRUNCATION)
+    for index in scene_map.nearest(view.camera, MAX_COMPARED):  # itself the first of them
+        distance, weight = signed_distance(points, scene_map.views[index], _TRUNCATION)
         total += weight * distance
         weights += weight
     mean = (total / weights.clamp(min=1e-30)).view_as(depths)

@@ -131,6 +131,11 @@ class GlobalMap:
         return len(self.views)
 
     @property
+    def given(self) -> tuple[MapView, ...]:
+        """The views that were not generated: the first ones."""
+        return tuple(view for view in self.views if view.origin.kind == GIVEN)
+
+    @property
     def cameras(self) -> Camera:
         """All cameras, batched."""
         return stack_cameras([view.camera for view in self.views])
@@ -190,9 +195,9 @@ class Prior:
         return self.depth > 0
 
 
-def prior_of(known: GlobalMap, camera: Camera, indices: Sequence[int]) -> Prior:
+def prior_of(scene_map: GlobalMap, camera: Camera, indices: Sequence[int]) -> Prior:
     """The map's picture, depth and confidence for a camera, from some of its views."""
-    views = [known.views[index] for index in indices]
+    views = [scene_map.views[index] for index in indices]
     cameras = stack_cameras([stack_cameras([view.camera for view in views])])
     depths = torch.stack([view.depth for view in views])[None]
     valid = torch.ones(1, len(views), dtype=torch.bool)

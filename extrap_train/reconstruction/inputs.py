@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from extrap_train.data.sequences import Frame
 from extrap_train.depth import RELIABLE_CONFIDENCE, DepthSource
-from extrap_train.errors import InputError
+from extrap_train.errors import InputError, did_you_mean
 from extrap_train.geometry.cameras import WorldFrame
 from extrap_train.geometry.orbits import fit_circle
 from extrap_train.geometry.viewpoints import (
@@ -44,21 +44,20 @@ def fit_world_frame(cameras: Camera) -> WorldFrame:
 def choose_frames(
     frames: Sequence[Frame], count: int | None, names: Sequence[str], draw: str, seed: int
 ) -> list[int]:
-    """Indices of the photographs to start from; InputError for names that there are not, or where
-    there are fewer than `count`.
+    """Indices of the photographs that `task=complete` starts from; InputError for names that there
+    are not, or where there are fewer than `count`.
 
+    They are in the order of the walk, or as they are named: the map grows from the first on. Other
+    tasks choose with `data.square_frames.select_input_frames`.
     `one_sided` walks along the orbit in steps near 25°, with no gap of 60° where that can be;
     `spread` takes the farthest cameras.
     """
     if names:
-        known = {frame.name: index for index, frame in enumerate(frames)}
-        missing = [name for name in names if name not in known]
-        if missing:
-            raise InputError(
-                f"input_frames: the scene has no frame {missing[0]}; it has "
-                f"{', '.join(list(known)[:4])} …"
-            )
-        return [known[name] for name in names]
+        places = {frame.name: index for index, frame in enumerate(frames)}
+        if missing := [name for name in names if name not in places]:
+            near = did_you_mean(missing[0], places)
+            raise InputError(f"input_frames: the scene has no frame {missing[0]}; {near}")
+        return [places[name] for name in names]
     if count is not None and count > len(frames):
         raise InputError(f"inputs={count}: the scene has {len(frames)} frames; give fewer")
     if count is None or count == len(frames):

@@ -40,14 +40,14 @@ def cloud_scores(
     return scores
 
 
-def drift(steps: Sequence[Step], known: GlobalMap) -> dict[str, float | int | None]:
+def drift(steps: Sequence[Step], scene_map: GlobalMap) -> dict[str, float | int | None]:
     """Where branches met: the largest of their errors, as a share of the scene's size.
 
     That is the median width of the pictures at the scene's centre, in scene units.
     """
     errors = [step.loop_error for step in steps if step.loop_error is not None]
-    center = torch.from_numpy(scene_center(known.cameras)).float()
-    cameras = known.cameras
+    center = torch.from_numpy(scene_center(scene_map.cameras)).float()
+    cameras = scene_map.cameras
     z = cameras.world_to_cam[:, 2, :3] @ center + cameras.world_to_cam[:, 2, 3]
     size = float((z * cameras.width / cameras.intrinsics[:, 0, 0]).median())
     return {
@@ -57,28 +57,32 @@ def drift(steps: Sequence[Step], known: GlobalMap) -> dict[str, float | int | No
     }
 
 
-def view_consistency(known: GlobalMap) -> float | None:
+def view_consistency(scene_map: GlobalMap) -> float | None:
     """Mean PSNR (dB) of generated views against their nearest generated view warped onto them,
     over the pixels that it reaches; None with fewer than two.
     """
-    generated = [i for i, view in enumerate(known.views) if view.origin.kind == GENERATED]
+    generated = [i for i, view in enumerate(scene_map.views) if view.origin.kind == GENERATED]
     values = []
     for index in generated:
-        view = known.views[index]
-        near = [i for i in known.nearest(view.camera, len(known)) if i in generated and i != index]
+        view = scene_map.views[index]
+        near = [
+            i
+            for i in scene_map.nearest(view.camera, len(scene_map))
+            if i in generated and i != index
+        ]
         if not near:
             return None
-        seen = prior_of(known, view.camera, near[:1])
+        seen = prior_of(scene_map, view.camera, near[:1])
         mask = seen.mask.to(seen.depth.dtype)[None]
         if mask.any():
             values.append(float(psnr(view.view.image[None], seen.image[None], mask)))
     return float(np.mean(values)) if values else None
 
 
-def coverage_of(known: GlobalMap) -> dict[str, float]:
+def coverage_of(scene_map: GlobalMap) -> dict[str, float]:
     """Share of the sphere of viewing directions that views stand within 20° of."""
-    directions = directions_from(known.cameras, scene_center(known.cameras))
-    given = np.array([v.origin.kind != GENERATED for v in known.views])
+    directions = directions_from(scene_map.cameras, scene_center(scene_map.cameras))
+    given = np.array([v.origin.kind != GENERATED for v in scene_map.views])
     return {
         "inputs": sphere_coverage(directions[given], float(SEEN_WITHIN_RAD)),
         "completed": sphere_coverage(directions, float(SEEN_WITHIN_RAD)),

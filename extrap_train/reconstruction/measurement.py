@@ -31,12 +31,12 @@ class Measured:
 
 
 def measure(
-    known: GlobalMap, picture: View, indices: Sequence[int], source: DepthSource
+    scene_map: GlobalMap, picture: View, indices: Sequence[int], source: DepthSource
 ) -> Measured:
     """Depth from the source's point maps of the new view with each of these known ones."""
     maps, worlds, depths = [], [], []
     for index in indices:
-        other = known.views[index]
+        other = scene_map.views[index]
         try:
             maps.append(source.point_maps(picture, other.view))
         except InputError:

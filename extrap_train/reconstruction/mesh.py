@@ -41,12 +41,12 @@ _MIN_SHARE = 0.01
 """Least share of all faces for a piece of the mesh to be kept."""
 
 
-def write_mesh(known: GlobalMap, world: WorldFrame, cloud: PointCloud, path: Path) -> int:
+def write_mesh(scene_map: GlobalMap, world: WorldFrame, cloud: PointCloud, path: Path) -> int:
     """Write the mesh as a binary PLY in the photographs' world; returns its number of faces.
 
     `cloud` is the map's, in the map's world. There is no file where there is no surface.
     """
-    mesh = mesh_of(known, cloud)
+    mesh = mesh_of(scene_map, cloud)
     if not len(mesh.faces):
         path.unlink(missing_ok=True)
         return 0
@@ -55,7 +55,7 @@ def write_mesh(known: GlobalMap, world: WorldFrame, cloud: PointCloud, path: Pat
     return len(mesh.faces)
 
 
-def mesh_of(known: GlobalMap, cloud: PointCloud) -> trimesh.Trimesh:
+def mesh_of(scene_map: GlobalMap, cloud: PointCloud) -> trimesh.Trimesh:
     """The surface that the cameras circle, in the map's world, in the colours of the cloud; its
     faces look towards the cameras. Empty where there is none.
     """
@@ -64,7 +64,7 @@ def mesh_of(known: GlobalMap, cloud: PointCloud) -> trimesh.Trimesh:
         return trimesh.Trimesh()
     low, high = near.points.amin(0) - _MARGIN * _CELL, near.points.amax(0) + _MARGIN * _CELL
     counts = [int(n) + 1 for n in (high - low) / _CELL]
-    mean, weight = _mean_distance(known, low, counts)
+    mean, weight = _mean_distance(scene_map, low, counts)
     seen = weight >= _MIN_WEIGHT
     whole = seen.clone()  # a cell by its upper corner, as marching cubes asks for it
     for axis in range(3):
@@ -82,14 +82,14 @@ def mesh_of(known: GlobalMap, cloud: PointCloud) -> trimesh.Trimesh:
 
 
 def _mean_distance(
-    known: GlobalMap, low: Float[Tensor, "3"], counts: list[int]
+    scene_map: GlobalMap, low: Float[Tensor, "3"], counts: list[int]
 ) -> tuple[Float[Tensor, "x y z"], Float[Tensor, "x y z"]]:
     """Signed distance to the surface at the grid's corners, in truncations, and its weight."""
     axes = [low[i] + _CELL * torch.arange(n) for i, n in enumerate(counts)]
     means, weights = [], []
     for points in torch.cartesian_prod(*axes).split(_AT_ONCE):
         total, weight = torch.zeros(len(points)), torch.zeros(len(points))
-        for view in known.views:
+        for view in scene_map.views:
             distance, confidence = signed_distance(points, view, _TRUNCATION)
             total += confidence * distance
             weight += confidence

@@ -58,7 +58,7 @@ class Proposal:
 
 
 def propose(
-    known: GlobalMap,
+    scene_map: GlobalMap,
     picture: View,
     indices: Sequence[int],
     source: DepthSource,
@@ -69,14 +69,16 @@ def propose(
     `indices` are the map's views that it is aligned to, nearest first. Everything that is known
     stays as it is.
     """
-    prior = prior_of(known, picture.camera, indices)
-    measured = measure(known, picture, indices, source)
-    agreement = _agreement(picture, prior, measured, known.tolerance)
+    prior = prior_of(scene_map, picture.camera, indices)
+    measured = measure(scene_map, picture, indices, source)
+    agreement = _agreement(picture, prior, measured, scene_map.tolerance)
     if options.support:
-        measured = supported(measured, prior, len(indices), known.tolerance)
-    contradicted = _contradicted(known, picture.camera, prior, measured) if options.repair else None
-    depth, confidence = _fused(prior, measured, known.tolerance, contradicted)
-    distrust = partial(_distrusted, known, picture.camera, agreement, options)
+        measured = supported(measured, prior, len(indices), scene_map.tolerance)
+    contradicted = None
+    if options.repair:
+        contradicted = _contradicted(scene_map, picture.camera, prior, measured)
+    depth, confidence = _fused(prior, measured, scene_map.tolerance, contradicted)
+    distrust = partial(_distrusted, scene_map, picture.camera, agreement, options)
     dropped = (depth > 0) & ~prior.mask & distrust(depth, confidence)
     depth, confidence = (torch.where(dropped, 0, x) for x in (depth, confidence))
     filled = continued_depth(depth, picture.image)
@@ -88,7 +90,7 @@ def propose(
 
 
 def propose_predicted(
-    known: GlobalMap,
+    scene_map: GlobalMap,
     picture: View,
     indices: Sequence[int],
     predictor: DepthPredictor,
@@ -100,22 +102,22 @@ def propose_predicted(
     confidence, scaled to stay below a photograph's. What the map shows only through unobserved
     space neither confirms the view nor contradicts it.
     """
-    prior = prior_of(known, picture.camera, indices)
-    found = predictor(known, picture, indices)
+    prior = prior_of(scene_map, picture.camera, indices)
+    found = predictor(scene_map, picture, indices)
     certain = found.certain & prior.mask
     agrees, testable = ncc_consistent(picture.image, prior.image, certain)
     agreement = float(agrees.sum() / testable.sum()) if testable.any() else 0.0
     depth = torch.where(certain, prior.depth, found.depth)
     confidence = torch.where(certain, prior.confidence, PREDICTED_CONFIDENCE * found.confidence)
     confidence = torch.where(depth > 0, confidence, 0)
-    distrusted = _distrusted(known, picture.camera, agreement, options, depth, confidence)
+    distrusted = _distrusted(scene_map, picture.camera, agreement, options, depth, confidence)
     confidence = torch.where(~certain & distrusted, 0, confidence)
     depth = torch.where(confidence > 0, depth, 0)
     return Proposal(replace(picture, depth=depth), confidence, agreement, len(indices))
 
 
 def _distrusted(
-    known: GlobalMap,
+    scene_map: GlobalMap,
     camera: Camera,
     agreement: float,
     options: ConfidenceConfig,
@@ -128,7 +130,7 @@ def _distrusted(
     if options.reject and agreement < options.least_agreement:
         return torch.ones_like(depth, dtype=torch.bool)
     if options.free_space:
-        return _seen_through(known, depth, confidence, camera)
+        return _seen_through(scene_map, depth, confidence, camera)
     return torch.zeros_like(depth, dtype=torch.bool)
 
 
@@ -147,13 +149,13 @@ def _agreement(picture: View, prior: Prior, measured: Measured, tolerance: float
 
 
 def _contradicted(
-    known: GlobalMap, camera: Camera, prior: Prior, measured: Measured
+    scene_map: GlobalMap, camera: Camera, prior: Prior, measured: Measured
 ) -> Bool[Tensor, "h w"]:
     """Where the map knows better: it has a surface in front of the measured one, or has looked
     through the measured one. In front of what it shows, a new surface contradicts nothing.
     """
     no_less_sure = prior.confidence > measured.confidence - AS_SURE
-    looked_through = _seen_through(known, measured.depth, measured.confidence, camera)
+    looked_through = _seen_through(scene_map, measured.depth, measured.confidence, camera)
     return no_less_sure & ((measured.depth > prior.depth) | looked_through)
 
 
@@ -189,7 +191,7 @@ def _fused(
 
 
 def _seen_through(
-    known: GlobalMap,
+    scene_map: GlobalMap,
     depth: Float[Tensor, "h w"],
     confidence: Float[Tensor, "h w"],
     camera: Camera,
@@ -197,9 +199,9 @@ def _seen_through(
     """Pixels whose point lies in front of what a more certain view has seen behind it."""
     points = unproject_to_world(depth, camera).flatten(0, 1)
     found = torch.zeros(len(points), dtype=torch.bool)
-    for index in known.nearest(camera, MAX_COMPARED):
-        other = known.views[index]
-        said = look_up(points, other.depth, other.camera, 2 * known.tolerance)
+    for index in scene_map.nearest(camera, MAX_COMPARED):
+        other = scene_map.views[index]
+        said = look_up(points, other.depth, other.camera, 2 * scene_map.tolerance)
         more_certain = other.confidence.flatten()[said.pixel] > confidence.flatten() + AS_SURE
         found |= (said.sight == Sight.IN_FRONT) & more_certain
     return found.view_as(depth) & (depth > 0)

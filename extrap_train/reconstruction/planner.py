@@ -74,48 +74,49 @@ def _cameras_at(world_to_cam: Float[np.ndarray, "n 4 4"], like: Camera) -> Camer
     return Camera(matrices, intrinsics, like.height, like.width)
 
 
-def next_query(known: GlobalMap, queries: list[Query]) -> Query:
+def next_query(scene_map: GlobalMap, queries: list[Query]) -> Query:
     """The query that the map covers best, of those 20–40° from their nearest known view.
 
     Of equals, the one farthest from the newest view, so that branches grow in turn. Where none is
     in range, the nearest one.
     """
-    cameras = stack_cameras([*(v.camera for v in known.views), *(q.camera for q in queries)])
-    angles = pairwise_angles(cameras, scene_center(known.cameras))[len(known) :, : len(known)]
+    cameras = stack_cameras([*(v.camera for v in scene_map.views), *(q.camera for q in queries)])
+    count = len(scene_map)
+    angles = pairwise_angles(cameras, scene_center(scene_map.cameras))[count:, :count]
     nearest = angles.min(1)
     in_range = (nearest >= NEAREST_RAD - 1e-6) & (nearest <= FARTHEST_RAD + 1e-6)
     if not in_range.any():
         return queries[int(nearest.argmin())]
     candidates = np.flatnonzero(in_range)
-    covered = np.array([coverage(known, queries[i].camera) for i in candidates])
+    covered = np.array([coverage(scene_map, queries[i].camera) for i in candidates])
     best = candidates[covered >= covered.max() - SAME_COVERAGE]
     return queries[best[angles[best, -1].argmax()]]
 
 
-def expected_order(known: GlobalMap, queries: list[Query]) -> list[Query]:
+def expected_order(scene_map: GlobalMap, queries: list[Query]) -> list[Query]:
     """The queries as angles alone order them, nearest first, branches in turn; coverage, which
     nobody knows before the views are made, may change it.
     """
-    cameras = stack_cameras([*(v.camera for v in known.views), *(q.camera for q in queries)])
-    angles = pairwise_angles(cameras, scene_center(known.cameras))
-    reached = list(range(len(known)))
-    left = list(range(len(known), len(angles)))
+    cameras = stack_cameras([*(v.camera for v in scene_map.views), *(q.camera for q in queries)])
+    angles = pairwise_angles(cameras, scene_center(scene_map.cameras))
+    reached = list(range(len(scene_map)))
+    left = list(range(len(scene_map), len(angles)))
     order = []
     while left:
         nearest = angles[np.ix_(left, reached)].min(1)
         equal = np.flatnonzero(nearest <= nearest.min() + NEAREST_RAD / 2)
         best = left[int(equal[angles[left][equal, reached[-1]].argmax()])]
-        order.append(queries[best - len(known)])
+        order.append(queries[best - len(scene_map)])
         reached.append(best)
         left.remove(best)
     return order
 
 
-def coverage(known: GlobalMap, camera: Camera) -> float:
+def coverage(scene_map: GlobalMap, camera: Camera) -> float:
     """Share of the camera's picture that the nearest views reach, generated ones included: what a
     new view can be aligned to.
     """
-    views = [known.views[i] for i in known.nearest(camera, REFERENCES)]
+    views = [scene_map.views[i] for i in scene_map.nearest(camera, REFERENCES)]
     small = [view.view.resized(PREVIEW_SIZE, PREVIEW_SIZE) for view in views]
     depths = torch.stack([view.depth for view in small if view.depth is not None])
     warp = warp_references(

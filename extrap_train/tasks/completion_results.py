@@ -51,7 +51,7 @@ SUBDIVIDE = 3
 class Completed:
     """A map that is whole, and how it came about."""
 
-    known: GlobalMap
+    scene_map: GlobalMap
     steps: Sequence[Step]
     world: WorldFrame
     truth: SyntheticScene | None
@@ -71,16 +71,16 @@ def write_completed(
     """Write everything, `summary.json` last."""
     started = time.perf_counter()
     confidence = config.complete.confidence
-    cloud = cloud_of(done.known, votes=confidence.votes, subdivide=SUBDIVIDE)
+    cloud = cloud_of(done.scene_map, votes=confidence.votes, subdivide=SUBDIVIDE)
     cloud = cloud[cloud.confidence >= confidence.least_confidence]
     outside = replace(cloud, points=done.world.points_outside(cloud.points))
     write_cloud(outside, folder / "cloud.ply")
-    write_views(done.known, done.world, folder)
-    write_colmap(done.known, done.world, outside, folder)
-    faces = write_mesh(done.known, done.world, cloud, folder / "mesh.ply")
-    draw_growth(done.known, cloud, folder / "growth.png")
-    draw_turntable(done.known, cloud, folder / "turntable.mp4")
-    _draw_views(done.known, folder / "views.png")
+    write_views(done.scene_map, done.world, folder)
+    write_colmap(done.scene_map, done.world, outside, folder)
+    faces = write_mesh(done.scene_map, done.world, cloud, folder / "mesh.ply")
+    draw_growth(done.scene_map, cloud, folder / "growth.png")
+    draw_turntable(done.scene_map, cloud, folder / "turntable.mp4")
+    _draw_views(done.scene_map, folder / "views.png")
     done.seconds["export"] = time.perf_counter() - started
     started = time.perf_counter()
     splats, no_splats = _fit_splats(done, config, folder)
@@ -89,11 +89,11 @@ def write_completed(
     held_out, missing = _compare_held_out(done, config, sequence, pipeline, folder)
     metrics = _metrics(done, cloud)
     done.seconds["measure"] = time.perf_counter() - started
-    given = {view.view.name for view in done.known.views if view.origin.kind == GIVEN}
+    given = {view.view.name for view in done.scene_map.given}
     summary = {
         "generated_with": asdict(used) if used else "exact renderings",
         "photographs": photograph_digests(f for f in sequence.frames if f.name in given),
-        "views": {kind: _count(done.known, kind) for kind in (GIVEN, GENERATED)},
+        "views": {GIVEN: len(given), GENERATED: len(done.scene_map) - len(given)},
         "points": len(cloud),
         "points_of_generated_views": int((cloud.view >= len(given)).sum()),
         "mesh_faces": faces,
@@ -101,9 +101,9 @@ def write_completed(
         "held_out": held_out,
         "splats": splats,
         "missing": missing | no_splats | ({} if faces else {"mesh": _NO_MESH}),
-        "loop": drift(done.steps, done.known),
-        "consistency_db": view_consistency(done.known),
-        "sphere_coverage": coverage_of(done.known),
+        "loop": drift(done.steps, done.scene_map),
+        "consistency_db": view_consistency(done.scene_map),
+        "sphere_coverage": coverage_of(done.scene_map),
         "seconds": done.seconds,
         "steps": [asdict(step) for step in done.steps],
         "provenance": provenance(config, {"scene": config.scene or ""}),
@@ -150,32 +150,27 @@ def _fit_splats(
     if not options.fit:
         return None, {}
     try:
-        return write_fitted_splats(done.known, done.world, options, config.seed, folder), {}
+        return write_fitted_splats(done.scene_map, done.world, options, config.seed, folder), {}
     except Diverged as error:
         return None, {"splats": str(error)}
-
-
-def _count(known: GlobalMap, kind: str) -> int:
-    return sum(view.origin.kind == kind for view in known.views)
 
 
 def _metrics(done: Completed, cloud: PointCloud) -> dict[str, dict[str, float]] | None:
     """3-D scores where the truth is known: of the inputs alone, and of everything."""
     if done.truth is None:
         return None
-    given = _count(done.known, GIVEN)
-    only = replace(done.known, views=done.known.views[:given])
+    only = replace(done.scene_map, views=done.scene_map.given)
     inputs = cloud_of(only, votes=False, subdivide=SUBDIVIDE)
     return cloud_scores({"inputs": inputs, "completed": cloud}, done.truth, done.world)
 
 
-def _draw_views(known: GlobalMap, path: Path) -> None:
+def _draw_views(scene_map: GlobalMap, path: Path) -> None:
     draw_contact_sheet(
         {
-            "view": torch.stack([view.view.image for view in known.views]),
-            "depth": colour_depth(torch.stack([view.depth for view in known.views])),
-            "confidence": torch.stack([v.confidence.expand(3, -1, -1) for v in known.views]),
-            "new points": torch.stack([v.fresh.float().expand(3, -1, -1) for v in known.views]),
+            "view": torch.stack([view.view.image for view in scene_map.views]),
+            "depth": colour_depth(torch.stack([view.depth for view in scene_map.views])),
+            "confidence": torch.stack([v.confidence.expand(3, -1, -1) for v in scene_map.views]),
+            "new points": torch.stack([v.fresh.float().expand(3, -1, -1) for v in scene_map.views]),
         },
         path,
     )
@@ -189,7 +184,7 @@ def _compare_held_out(
     folder: Path,
 ) -> tuple[dict[str, float | None] | None, dict[str, str]]:
     """Views generated at the poses of photographs that were no inputs, against these."""
-    given = done.known.views[: _count(done.known, GIVEN)]
+    given = done.scene_map.given
     known = {view.view.name for view in given} | set(frames_learnt(config, sequence.frames))
     frames = _held_out(given, done.world, sequence, known)[: config.complete.held_out]
     if not frames or config.complete.generator == "exact":
@@ -200,9 +195,9 @@ def _compare_held_out(
         return None, {}
     cameras = [done.world.inside(view.camera) for view in truth]
     made, warps, masks = [], [], []
-    only = GlobalMap(done.known.tolerance, given)
+    only = GlobalMap(done.scene_map.tolerance, given)
     for view, camera in zip(truth, cameras, strict=True):
-        near = [done.known.views[i].view for i in _elsewhere(done.known, camera)]
+        near = [done.scene_map.views[i].view for i in _elsewhere(done.scene_map, camera)]
         query = stack_cameras([camera])
         generated = pipeline.generator.generate(near, query, [view.name], config.seed)
         made.append(generated.images[0])
@@ -246,12 +241,12 @@ def _held_out(
     ]
 
 
-def _elsewhere(known: GlobalMap, camera: Camera) -> list[int]:
+def _elsewhere(scene_map: GlobalMap, camera: Camera) -> list[int]:
     """The nearest views that do not stand where the camera does: `complete.poses=capture` has made
     views there, which would be generated from themselves.
     """
-    there = stand_where(camera, known.cameras, np.zeros(3))
-    return [i for i in known.nearest(camera, len(known)) if not there[i]][:REFERENCES]
+    there = stand_where(camera, scene_map.cameras, np.zeros(3))
+    return [i for i in scene_map.nearest(camera, len(scene_map)) if not there[i]][:REFERENCES]
 
 
 def _print_summary(summary: dict[str, Any], console: Console) -> None:

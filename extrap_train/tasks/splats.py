@@ -26,7 +26,7 @@ from extrap_train.views import View
 
 
 def write_fitted_splats(
-    known: GlobalMap, world: WorldFrame, options: SplatsConfig, seed: int, folder: Path
+    scene_map: GlobalMap, world: WorldFrame, options: SplatsConfig, seed: int, folder: Path
 ) -> dict[str, float]:
     """Fit 3DGS to all views of the map, in the photographs' world, from the views' own depth.
 
@@ -35,7 +35,7 @@ def write_fitted_splats(
     show of the views, and the seconds that fitting took (0: used again). `Diverged` where fitting
     fails.
     """
-    views = [_outside(each.view, world) for each in known.views]
+    views = [_outside(each.view, world) for each in scene_map.views]
     gaussian_options = GaussianOptions(
         iterations=options.iterations,
         init="dense",
@@ -51,7 +51,7 @@ def write_fitted_splats(
     seconds = time.perf_counter() - started if fresh else 0.0
     splats = read_splats(path)
     truth = torch.stack([view.image for view in views])
-    drawn = quantised(_draw_views(_inside(splats, world), known, gaussian_options))
+    drawn = quantised(_draw_views(_inside(splats, world), scene_map, gaussian_options))
     draw_contact_sheet(
         {"view": truth, "splats": drawn, "error": error_map(drawn, truth)}, folder / "splats.png"
     )
@@ -91,9 +91,9 @@ def _inside(splats: Gaussians, world: WorldFrame) -> Gaussians:
 
 @torch.no_grad()
 def _draw_views(
-    splats: Gaussians, known: GlobalMap, options: GaussianOptions
+    splats: Gaussians, scene_map: GlobalMap, options: GaussianOptions
 ) -> Float[Tensor, "n 3 h w"]:
     rasterize, behind = rasterizer(options.rasterizer), BACKGROUNDS[options.background]
-    cameras = [view.camera for view in known.views]
+    cameras = [view.camera for view in scene_map.views]
     drawn = [draw(rasterize, splats, camera, behind, options.sh_degree) for camera in cameras]
     return torch.stack([each.image for each in drawn]).clamp(0, 1)

@@ -74,14 +74,14 @@ def draw_examples(
     options = CompletionConfig(confidence=ConfidenceConfig(regenerate=False))
     recorder = _Recorder(truth, world, source, rng.uniform(0, LARGEST_ERROR), rng)
     pipeline = CompletionPipeline(generator, source, options, int(rng.integers(2**31)), recorder)
-    known = map_of_inputs(views, confidences, options.tolerance)
-    queries = orbit_queries(known.cameras, np.radians(rng.uniform(*STEP_DEG)))
-    known = complete(known, queries, pipeline, lambda *_: None)
-    for index, view in enumerate(known.views):
+    scene_map = map_of_inputs(views, confidences, options.tolerance)
+    queries = orbit_queries(scene_map.cameras, np.radians(rng.uniform(*STEP_DEG)))
+    scene_map = complete(scene_map, queries, pipeline, lambda *_: None)
+    for index, view in enumerate(scene_map.views):
         if view.origin.kind == GENERATED:
-            nearest = known.nearest(view.camera, options.edges + 1)
+            nearest = scene_map.nearest(view.camera, options.edges + 1)
             others = [other for other in nearest if other != index]
-            recorder(known, view.view, others[: options.edges])
+            recorder(scene_map, view.view, others[: options.edges])
     return combine(recorder.examples, torch.cat)
 
 
@@ -96,8 +96,10 @@ class _Recorder:
     rng: np.random.Generator
     examples: list[DepthExamples] = field(default_factory=list)
 
-    def __call__(self, known: GlobalMap, picture: View, indices: Sequence[int]) -> PredictedDepth:
-        seen = observe_in_map(known, picture, indices, self.source)
+    def __call__(
+        self, scene_map: GlobalMap, picture: View, indices: Sequence[int]
+    ) -> PredictedDepth:
+        seen = observe_in_map(scene_map, picture, indices, self.source)
         camera = picture.camera.resized(*seen.certain.shape[-2:])
         depth, mask = self.truth(self.world.outside(camera))
         depth = depth / self.world.unit

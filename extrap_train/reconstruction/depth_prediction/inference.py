@@ -51,7 +51,9 @@ class PredictedDepth:
 class DepthPredictor(Protocol):
     """Predicts the depth of a generated view; the network does, and a test's oracle."""
 
-    def __call__(self, known: GlobalMap, picture: View, indices: Sequence[int]) -> PredictedDepth:
+    def __call__(
+        self, scene_map: GlobalMap, picture: View, indices: Sequence[int]
+    ) -> PredictedDepth:
         """The depth of a picture, of which the map's views `indices` show parts."""
         ...
 
@@ -65,9 +67,11 @@ class NetworkDepth:
     """Measures what the network starts from."""
 
     @torch.inference_mode()
-    def __call__(self, known: GlobalMap, picture: View, indices: Sequence[int]) -> PredictedDepth:
+    def __call__(
+        self, scene_map: GlobalMap, picture: View, indices: Sequence[int]
+    ) -> PredictedDepth:
         """See `DepthPredictor`."""
-        seen = observe_in_map(known, picture, indices, self.source)
+        seen = observe_in_map(scene_map, picture, indices, self.source)
         log_depth, confidence = self.network(seen.features).best()
         fitted = fit_to_known(log_depth[0], seen.warp_log_depth[0], seen.certain[0])
         completed = PredictedDepth(
@@ -77,12 +81,12 @@ class NetworkDepth:
 
 
 def observe_in_map(
-    known: GlobalMap, picture: View, indices: Sequence[int], source: DepthSource
+    scene_map: GlobalMap, picture: View, indices: Sequence[int], source: DepthSource
 ) -> Observation:
     """Describe a picture at the network's size by what the map's views `indices` show of it."""
-    views = [known.views[index] for index in indices]
+    views = [scene_map.views[index] for index in indices]
     size = (WORKING_SIZE, WORKING_SIZE)
-    found = measure(known, picture, indices, source)
+    found = measure(scene_map, picture, indices, source)
     measured = torch.stack([found.depth, found.confidence]) * found.reliable
     if measured.shape[-2:] != size:
         measured = resample_surfaces(measured, size)
@@ -93,7 +97,7 @@ def observe_in_map(
         torch.stack([view.depth for view in views])[None],
         torch.stack([view.confidence for view in views])[None],
         stack_cameras([stack_cameras([view.camera for view in views])]),
-        Ball.around(known.cameras),
+        Ball.around(scene_map.cameras),
         measured[:1],
         measured[1:],
     )
