@@ -202,7 +202,7 @@ def explain(error: Exception, options: CommandOptions, overrides: Sequence[str])
     cause = error if isinstance(error, OmegaConfBaseException) else error.__cause__
     if isinstance(cause, OmegaConfBaseException) and cause.full_key:
         key = re.sub(r"\[\d+\]$", "", cause.full_key)
-        if isinstance(cause, ValidationError) and key in options.known:
+        if isinstance(cause, ValidationError) and key in options.by_name:
             return _wrong_value(key, cause, options, overrides)
         if isinstance(cause, ConfigKeyError | AttributeError):
             return unknown_option(key, options)
@@ -212,7 +212,7 @@ def explain(error: Exception, options: CommandOptions, overrides: Sequence[str])
 def _wrong_value(
     key: str, cause: ValidationError, options: CommandOptions, overrides: Sequence[str]
 ) -> str:
-    option = options.known[key]
+    option = options.by_name[key]
     given = next((word for word in overrides if word.startswith(f"{key}=")), key)
     if given == f"{key}=null" and not option.may_be_null:
         return f"{given}: cannot be null"

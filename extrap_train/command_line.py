@@ -64,7 +64,7 @@ class CommandOptions:
         return {group: variants for group, variants in GROUPS.items() if group in own}
 
     @cached_property
-    def known(self) -> dict[str, Option]:
+    def by_name(self) -> dict[str, Option]:
         """Every option, those of all variants among them."""
         nested = {"depth.matcher": GROUPS["matcher"]} if "depth" in self.groups else {}
         found = dict(options_of(self.tree))
@@ -75,14 +75,14 @@ class CommandOptions:
 
     def find(self, key: str) -> Option | None:
         """The option that a key sets; an entry of a mapping is set by a longer key."""
-        if key in self.known:
-            return self.known[key]
-        above = (option for name, option in self.known.items() if key.startswith(f"{name}."))
+        if key in self.by_name:
+            return self.by_name[key]
+        above = (option for name, option in self.by_name.items() if key.startswith(f"{name}."))
         return next((option for option in above if option.kind is dict), None)
 
     def has_options_below(self, key: str) -> bool:
         """Whether the key names a part of the tree instead of an option."""
-        return any(name.startswith(f"{key}.") for name in self.known)
+        return any(name.startswith(f"{key}.") for name in self.by_name)
 
     def variants_with(self, key: str) -> list[str]:
         """The choices, as they are typed, that have an option which others of the group lack."""
@@ -93,7 +93,7 @@ class CommandOptions:
 
     def suggest(self, key: str) -> str:
         """`; did you mean …?` where an option or a group looks like it."""
-        return suggest(key, [*self.known, *self.groups, *self.file_groups])
+        return suggest(key, [*self.by_name, *self.groups, *self.file_groups])
 
 
 def choices_of(group: str, own_folders: Sequence[str] = ()) -> list[str]:

@@ -51,7 +51,7 @@ def test_help_has_a_line_for_every_option_with_its_default(
     command: Callable[[], None], options: CommandOptions, said: Said
 ) -> None:
     lines = said(command, "trainer.steps=77", "--help").splitlines()
-    for option in options.known.values():
+    for option in options.by_name.values():
         own = [line for line in lines if line.strip().startswith(f"{option.name}=")]
         if option.declared.help and not option.name.startswith("depth.matcher."):
             assert own, option.name

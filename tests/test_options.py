@@ -13,7 +13,7 @@ from extrap_train.errors import InputError
 
 
 def _all_options() -> list[Option]:
-    trees = [TRAIN.known, PREP.known, options_of(TableConfig)]
+    trees = [TRAIN.by_name, PREP.by_name, options_of(TableConfig)]
     named = {name: found for tree in trees for name, found in tree.items()}
     return [found for name, found in named.items() if not name.endswith(".name")]
 
@@ -45,7 +45,7 @@ def test_every_number_out_of_its_range_is_refused_by_name() -> None:
 
 
 def test_every_word_that_is_not_known_is_refused_by_name() -> None:
-    words = [found for found in _all_options() if found.declared.known]
+    words = [found for found in _all_options() if found.declared.choices]
     assert len(words) > 10
     for found in words:
         found.check([] if found.default is None else found.default)

@@ -61,7 +61,7 @@ class Diffusion:
     family: str = option(
         "ours",
         "what the model is conditioned on; the weights must be of this family",
-        known=FAMILIES,
+        choices=FAMILIES,
     )
     weights: str | None = option(
         None,

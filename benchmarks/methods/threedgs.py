@@ -147,7 +147,7 @@ class MonocularMethod(ThreeDgs):
     monocular: str = option(
         "surrogate",
         "monocular depth: the depth source under an unknown affine map, or as it is",
-        known=("surrogate", "depth_source"),
+        choices=("surrogate", "depth_source"),
     )
 
     def priors(self, scene: TrainingScene) -> tuple[DepthSource, list[Float[Tensor, "h w"]]]:

@@ -48,7 +48,7 @@ class TrainerConfig:
         "auto",
         "Lightning's precision; weights stay in single precision; auto: bf16-mixed where the "
         "processor has units for it, else 32-true",
-        known=("auto", "32-true", "bf16-mixed", "16-mixed"),
+        choices=("auto", "32-true", "bf16-mixed", "16-mixed"),
     )
     gradient_checkpointing: bool = option(
         False, "compute the denoiser's activations twice: less memory, more time"
@@ -65,7 +65,7 @@ class TrainerConfig:
     accelerator: str = option(
         "auto",
         "hardware to train on; auto takes a GPU if there is one",
-        known=("auto", "cpu", "gpu", "cuda", "mps"),
+        choices=("auto", "cpu", "gpu", "cuda", "mps"),
     )
     deterministic: bool = option(
         False,
@@ -102,7 +102,7 @@ class LoggerConfig:
     name: str = option(
         "tensorboard",
         "where metrics, options and sample sheets go beside the run's folder; csv: nowhere else",
-        known=("csv", "mlflow", "tensorboard", "wandb"),
+        choices=("csv", "mlflow", "tensorboard", "wandb"),
     )
 
 
@@ -195,7 +195,7 @@ class TrainConfig(SceneOptions):
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
     validation: ValidationConfig = field(default_factory=ValidationConfig)
     complete: CompletionConfig = field(default_factory=CompletionConfig)
-    task: str = option("category", "what to do; see Tasks", known=tuple(TASKS))
+    task: str = option("category", "what to do; see Tasks", choices=tuple(TASKS))
     seed: int = option(0, "seed of everything random", low=0, high=2**30)
     run: str | None = option(
         None,

@@ -129,7 +129,7 @@ class PrepConfig:
     full_circle: str = option(
         "prefer",
         "sequences that are not a full circle: drop all, drop all if others are one, or keep them",
-        known=("require", "prefer", "ignore"),
+        choices=("require", "prefer", "ignore"),
     )
     correct: bool | None = option(
         None,

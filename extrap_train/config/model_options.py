@@ -57,7 +57,7 @@ class SamplerConfig:
     solver: str = option(
         "ddim",
         "sampler: DDIM (paper), or of second order for few steps",
-        known=("ddim", "dpmpp", "unipc"),
+        choices=("ddim", "dpmpp", "unipc"),
     )
     steps: int = option(2, "evaluations of the denoiser", low=1, high=1000)
     eta: float = option(
@@ -82,7 +82,7 @@ class SamplerConfig:
         None,
         "sample as ZeroNVS and MegaScenes were published: guidance against zeros, without the "
         "noisiest step",
-        known=("megascenes",),
+        choices=("megascenes",),
     )
 
 
@@ -117,7 +117,7 @@ class ModelConfig:
         "ours",
         "what the denoiser is conditioned on: the pose, also the nearest reference's warp, or the "
         "fused warp with its encoding and mask",
-        known=FAMILIES,
+        choices=FAMILIES,
     )
     image_size: int = option(
         64, "side of the square views that are generated", unit="pixels", low=8, high=4096
@@ -155,7 +155,7 @@ class ModelConfig:
     prediction: str = option(
         "sample",
         "what the denoiser predicts: the noise, v, or the clean latent",
-        known=("epsilon", "v_prediction", "sample"),
+        choices=("epsilon", "v_prediction", "sample"),
     )
     zero_terminal_snr: bool = option(
         True, "make the noisiest step pure noise, as sampling starts from (Lin et al. 2023)"

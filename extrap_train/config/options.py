@@ -32,7 +32,7 @@ class Declared:
     unit: str = ""
     low: int | float = -math.inf
     high: int | float = math.inf
-    known: tuple[str, ...] = ()
+    choices: tuple[str, ...] = ()
     """The words that a text, or a key of a mapping, may be; empty where any is right."""
     is_set: bool = False
     """Whether a list must not hold a value twice."""
@@ -63,8 +63,8 @@ class Option:
     @property
     def item_must_be(self) -> str:
         """What a value of it is, or of a list one of its values."""
-        if self.declared.known:
-            return f"must be one of {', '.join(self.declared.known)}"
+        if self.declared.choices:
+            return f"must be one of {', '.join(self.declared.choices)}"
         return f"must be {_KINDS.get(self.kind, 'a mapping, as {name: value}')}"
 
     @property
@@ -78,7 +78,7 @@ class Option:
     @property
     def row(self) -> tuple[str, str]:
         """Its line in a `--help`: name and default; meaning, unit and range."""
-        limits = [self.declared.unit, " | ".join(self.declared.known) or self.range]
+        limits = [self.declared.unit, " | ".join(self.declared.choices) or self.range]
         said = ", ".join(filter(None, limits))
         return f"{self.name}={_shown(self.default)}", self.declared.help + (
             f" ({said})" if said else ""
@@ -90,8 +90,9 @@ class Option:
         for index, item in enumerate(items):
             if self.declared.is_set and item in items[:index]:
                 raise InputError(f"{self.name}: {item} is listed twice; leave one out")
-            if isinstance(item, str) and self.declared.known:
-                require_one_of(self.name, item, self.declared.known)
+            choices = self.declared.choices
+            if isinstance(item, str) and choices and item not in choices:
+                raise InputError(f"{self.name}={item} is unknown; known: {', '.join(choices)}")
             is_number = isinstance(item, int | float)
             if is_number and not self.declared.low <= item <= self.declared.high:
                 raise InputError(f"{self.name}={value}: must be {self.range}")
@@ -104,11 +105,11 @@ def option(
     unit: str = "",
     low: int | float = -math.inf,
     high: int | float = math.inf,
-    known: tuple[str, ...] = (),
+    choices: tuple[str, ...] = (),
     is_set: bool = False,
 ) -> Any:
     """A dataclass field that is an option, with its default."""
-    metadata = {"option": Declared(meaning, unit, low, high, known, is_set)}
+    metadata = {"option": Declared(meaning, unit, low, high, choices, is_set)}
     if isinstance(default, list | dict):
         return field(default_factory=lambda: copy.copy(default), metadata=metadata)
     return field(default=default, metadata=metadata)
@@ -194,12 +195,6 @@ def dotted(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
         else:
             items[prefix + key] = value
     return items
-
-
-def require_one_of(name: str, value: str, known: tuple[str, ...]) -> None:
-    """InputError unless the option's value is one of the known words."""
-    if value not in known:
-        raise InputError(f"{name}={value} is unknown; known: {', '.join(known)}")
 
 
 def resolve_paths(options: Options) -> Options:

@@ -120,12 +120,12 @@ class CompletionConfig:
     draw: str = option(
         "one_sided",
         "how task=complete chooses its inputs: neighbours, or spread around the scene",
-        known=("one_sided", "spread"),
+        choices=("one_sided", "spread"),
     )
     poses: str = option(
         "orbit",
         "where new views are made: on the orbit fitted to the inputs, or at the capture's poses",
-        known=("orbit", "capture"),
+        choices=("orbit", "capture"),
     )
     step_deg: float = option(
         30.0, "angle between neighbouring views of the orbit", unit="degrees", low=1, high=180
@@ -134,7 +134,7 @@ class CompletionConfig:
         "photographs",
         "what new views are generated from: the photographs alone, or from generated views, too, "
         "as in the paper",
-        known=("photographs", "all"),
+        choices=("photographs", "all"),
     )
     edges: int = option(4, "known views that a new one is aligned to", low=1, high=64)
     tolerance: float = option(
@@ -146,7 +146,7 @@ class CompletionConfig:
     generator: str = option(
         "model",
         "what makes new views: the model, or the exact renderer of a synthetic scene",
-        known=("model", "exact"),
+        choices=("model", "exact"),
     )
     depth_network: str | None = option(
         None,

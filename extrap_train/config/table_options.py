@@ -31,7 +31,7 @@ class MetricConfig:
     factory: str = MISSING
     """`package.module.Class`; its fields are the options."""
     better: str = option(
-        "neither", "which values of the metric are better", known=("higher", "lower", "neither")
+        "neither", "which values of the metric are better", choices=("higher", "lower", "neither")
     )
     options: dict[str, Any] = field(default_factory=dict)
 
@@ -56,7 +56,7 @@ class CapturesConfig:
         "synthetic",
         "data set: rendered, CO3D, folders with transforms.json and train_test_split_N.json, or "
         "anything that scene= takes",
-        known=CAPTURE_SOURCES,
+        choices=CAPTURE_SOURCES,
     )
     root: str | None = option(None, "folder of the data set; null renders the captures")
     categories: list[str] = option([], "categories that are measured", is_set=True)
@@ -101,7 +101,7 @@ class RulesConfig:
         ["random", "spread", "one_sided"],
         "how the inputs may be drawn from the pool",
         is_set=True,
-        known=DRAWS,
+        choices=DRAWS,
     )
     seeds: list[int] = option(
         [0], "seeds of the draws and of the methods' own randomness", is_set=True, low=0, high=2**30
@@ -123,12 +123,12 @@ class ScoringConfig:
     """What judges images besides the usual metrics: perceptual networks, and metrics of yours."""
 
     lpips: list[str] = option(
-        ["alex"], "LPIPS backbones, one column each", known=LPIPS_NETS, is_set=True
+        ["alex"], "LPIPS backbones, one column each", choices=LPIPS_NETS, is_set=True
     )
     lpips_weights: dict[str, str] = option(
         {},
         "full lpips.LPIPS state dicts by net; a net not named takes torch's hub cache",
-        known=LPIPS_NETS,
+        choices=LPIPS_NETS,
     )
     dists: bool = option(True, "measure DISTS, with torchvision's VGG-16 from torch's hub cache")
     metrics: list[str] = option(
@@ -165,7 +165,9 @@ class TableConfig:
     options: dict[str, dict[str, Any]] = option(
         {}, "options by method, as options.ours.weights=FOLDER; they replace those of its file"
     )
-    draws: list[str] = option(["random"], "which of rules.draws are run", known=DRAWS, is_set=True)
+    draws: list[str] = option(
+        ["random"], "which of rules.draws are run", choices=DRAWS, is_set=True
+    )
     quick: QuickConfig = field(default_factory=QuickConfig)
     columns: list[str] = option(
         [],
@@ -179,7 +181,7 @@ class TableConfig:
     device: str = option(
         "auto",
         "device of the methods; auto: CUDA if there is one",
-        known=("auto", "cpu", "cuda"),
+        choices=("auto", "cpu", "cuda"),
     )
     cell_timeout_s: float = option(
         6 * 3600.0, "most time that a method may take for one cell", unit="s", low=1, high=1e7

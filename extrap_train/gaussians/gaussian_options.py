@@ -23,7 +23,7 @@ class GaussianOptions:
     init: str = option(
         "triangulated",
         "SIFT between the inputs at their poses, the depth source's pixels (dense), or random",
-        known=("triangulated", "dense", "random"),
+        choices=("triangulated", "dense", "random"),
     )
     init_points: int = option(
         1000, "points of random, most of dense; triangulated is filled up to it at random", low=0
@@ -34,7 +34,7 @@ class GaussianOptions:
     sh_every: int = option(1000, "iterations after which another degree takes part", low=1)
     ssim_weight: float = option(0.2, "weight of 1 - SSIM in the photometric loss", low=0)
     l1_weight: float = option(0.8, "weight of L1 in the photometric loss", low=0)
-    background: str = option("black", "behind everything", known=tuple(BACKGROUNDS))
+    background: str = option("black", "behind everything", choices=tuple(BACKGROUNDS))
 
     means_rate: float = option(1.6e-4, "learning rate of positions, in extents", low=0)
     means_rate_final: float = option(1.6e-6, "the same at the end", low=0)
@@ -67,7 +67,7 @@ class GaussianOptions:
     reset_first: int = option(3000, "iteration of the first reset", low=0)
     reset_opacity: float = option(0.01, "opacity after a reset", low=0, high=1)
     rasterizer: str = option(
-        "numba", "numba on the CPU, or gsplat on a GPU", known=tuple(RASTERIZERS)
+        "numba", "numba on the CPU, or gsplat on a GPU", choices=tuple(RASTERIZERS)
     )
 
     @property
