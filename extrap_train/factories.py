@@ -30,17 +30,14 @@ def make_object(
     found = import_factory(factory, name)
     made = found(**_typed_options(found, options, name, prefix))
     if not isinstance(made, protocol):
-        lacks = ", ".join(part for part in _parts(protocol) if not hasattr(made, part))
+        parts = [part for part in dir(protocol) if not part.startswith("_")]
+        lacks = ", ".join(part for part in parts if not hasattr(made, part))
         raise InputError(
             f"{name}: {factory} lacks {lacks}; see {protocol.__module__}.{protocol.__name__}"
         )
     if is_dataclass(made):
         check_options(made, prefix)
     return made
-
-
-def _parts(protocol: type) -> list[str]:
-    return [name for name in dir(protocol) if not name.startswith("_")]
 
 
 def import_factory(factory: str, name: str) -> Any:

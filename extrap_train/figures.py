@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from matplotlib import font_manager
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
@@ -106,6 +107,30 @@ def plot_curve(steps: list[int], series: dict[str, list[float]], label: str, pat
     axes.set_ylabel(label)
     axes.legend()
     save_figure(figure, path)
+
+
+def plot_cameras(
+    axes: Axes,
+    offsets: Float[np.ndarray, "n 3"],
+    forward: Float[np.ndarray, "n 3"],
+    plane: Float[np.ndarray, "3 2"],
+    colour: str,
+    label: str = "",
+) -> None:
+    """Draw cameras as numbered arrows along their optical axes, projected onto a plane.
+
+    A cross marks the point that their `offsets` are from; `forward` are unit vectors.
+    """
+    length = 0.2 * np.linalg.norm(offsets, axis=1).mean()
+    (x, y), (u, v) = (offsets @ plane).T, length * (forward @ plane).T
+    axes.quiver(
+        x, y, u, v, color=colour, label=label,
+        angles="xy", scale_units="xy", scale=1, width=0.006,
+    )  # fmt: skip
+    for number, place in enumerate(zip(x, y, strict=True), 1):
+        axes.annotate(str(number), place, color=colour)
+    axes.plot(0, 0, "k+")
+    axes.set_aspect("equal")
 
 
 def save_figure(figure: Figure, path: Path, dpi: int = 100) -> None:

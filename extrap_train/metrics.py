@@ -6,6 +6,7 @@ import math
 import re
 import warnings
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from unittest.mock import patch
 
@@ -120,16 +121,7 @@ def lpips_distance(net: str, weights: str | None, option: str) -> Distance:
         file.fill(network, file.tensors(file.read()))
     network.requires_grad_(False)
 
-    @torch.no_grad()
-    def distance(
-        prediction: Float[Tensor, "b 3 h w"], truth: Float[Tensor, "b 3 h w"]
-    ) -> Float[Tensor, " b"]:
-        for images in (prediction, truth):
-            require_unit_range(images)
-        values = network(prediction.cpu(), truth.cpu(), normalize=True)
-        return values.flatten()
-
-    return distance
+    return _distance_by(partial(network, normalize=True))
 
 
 def lpips_or_reason(weights: str | None) -> tuple[Distance | None, dict[str, str]]:
@@ -161,6 +153,12 @@ def dists_distance() -> Distance:
     with patch.object(dists, "vgg16", empty_vgg16):
         network = dists.DISTSNetwork().eval()
     _fill_backbone(network, *backbone)
+
+    return _distance_by(network)
+
+
+def _distance_by(network: Callable[..., Tensor]) -> Distance:
+    """The network's answer, computed on the CPU, for images that must lie in [0, 1]."""
 
     @torch.no_grad()
     def distance(

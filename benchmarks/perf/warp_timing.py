@@ -37,7 +37,7 @@ def _compare_splats(size: int, device: torch.device) -> Timing:
     return compare(
         f"{len(ANGLES_DEG)} references, {size}x{size}, {CHANNELS} channels",
         device,
-        lambda: splat_points(points, values, query).means,
+        lambda: splat_points(points, values, query),
         lambda: splat_reference(points, values, query).permute(2, 0, 1),
     )
 

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 
-from extrap_train.figures import save_figure
+from extrap_train.figures import plot_cameras, save_figure
 from extrap_train.geometry.epipolar import epipolar_lines, fundamental_matrix
 from extrap_train.geometry.viewpoints import camera_centers, fit_orbit
 from extrap_train.reconstruction.capture_check import FAR_PIXELS, CaptureCheck, MatchedViews
@@ -103,7 +103,6 @@ def _draw_cameras(plan: Axes, side: Axes, check: CaptureCheck) -> None:
     orbit = fit_orbit(cameras)
     centers = camera_centers(cameras) - orbit.center
     forward = cameras.forward.double().numpy()
-    length = 0.2 * float(np.linalg.norm(centers, axis=1).mean())
     points = np.concatenate([m.points.numpy()[m.distances < FAR_PIXELS] for m in check.matched])
     points = points[np.isfinite(points).all(1)] - orbit.center
     reach = 1.3 * np.abs(centers).max()
@@ -114,23 +113,14 @@ def _draw_cameras(plan: Axes, side: Axes, check: CaptureCheck) -> None:
     ):
         plane = np.stack([east, up], 1)
         axis.scatter(*_uv(points @ plane), s=2, c="0.6")
-        (x, y), (u, v) = (centers @ plane).T, length * (forward @ plane).T
-        axis.quiver(x, y, u, v, color="C0", angles="xy", scale_units="xy", scale=1, width=0.006)
-        _number_cameras(axis, x, y)
-        axis.plot(0, 0, "k+")
+        plot_cameras(axis, centers, forward, plane, "C0")
         axis.set_xlim(-reach, reach)
         axis.set_ylim(-reach, reach)
-        axis.set_aspect("equal")
         axis.set_title(f"cameras {title}, in the scene's unit", fontsize=9)
 
 
 def _uv(places: Float[np.ndarray, "n 2"]) -> tuple[np.ndarray, np.ndarray]:
     return places[:, 0], places[:, 1]
-
-
-def _number_cameras(axis: Axes, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> None:
-    for number, place in enumerate(zip(x, y, strict=True)):
-        axis.annotate(str(number + 1), place, color="C3", fontsize=8)
 
 
 def _draw_distances(axis: Axes, check: CaptureCheck) -> None:

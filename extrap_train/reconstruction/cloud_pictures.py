@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrap_train.figures import draw_contact_sheet, save_figure, write_film
+from extrap_train.figures import draw_contact_sheet, plot_cameras, save_figure, write_film
 from extrap_train.geometry.orbits import fit_circle
 from extrap_train.geometry.viewpoints import camera_centers, scene_center
 from extrap_train.geometry.warp import splat_points
@@ -78,24 +78,14 @@ def framed(cameras: Camera, cloud: PointCloud) -> Camera:
 def draw_plan(scene_map: GlobalMap, queries: Sequence[Query], path: Path) -> None:
     """Inputs and queries seen from above, numbered in the order in which they are planned."""
     circle = fit_circle(scene_map.cameras)
-    north = np.cross(circle.axis, circle.east)
+    plane = np.stack([circle.east, np.cross(circle.axis, circle.east)], 1)
     figure, axes = plt.subplots(figsize=(5, 5), layout="constrained")
     planned = stack_cameras([query.camera for query in queries]) if queries else None
     for cameras, colour, label in ((scene_map.cameras, "C0", "given"), (planned, "C1", "planned")):
         if cameras is None:
             continue
-        offsets = camera_centers(cameras) - circle.center
-        x, y = offsets @ circle.east, offsets @ north
-        forward = cameras.forward.double().numpy()
-        length = 0.2 * np.linalg.norm(offsets, axis=1).mean()
-        axes.quiver(
-            x, y, length * (forward @ circle.east), length * (forward @ north),
-            color=colour, angles="xy", scale_units="xy", scale=1, width=0.006, label=label,
-        )  # fmt: skip
-        for number, (u, v) in enumerate(zip(x, y, strict=True)):
-            axes.annotate(str(number + 1), (u, v), color=colour)
-    axes.plot(0, 0, "k+")
-    axes.set_aspect("equal")
+        offsets, forward = camera_centers(cameras) - circle.center, cameras.forward.double().numpy()
+        plot_cameras(axes, offsets, forward, plane, colour, label)
     axes.legend()
     save_figure(figure, path)
 
@@ -118,5 +108,5 @@ def _draw_cloud(cloud: PointCloud, cameras: Camera) -> Float[Tensor, "n 3 h w"]:
     pictures = []
     for index in range(len(cameras.world_to_cam)):
         drawn = splat_points(cloud.points, cloud.colors, cameras[index])
-        pictures.append(torch.where(drawn.weight > 0, drawn.values, 1.0))
+        pictures.append(torch.where(drawn[-1] > 0, drawn[:-1], 1.0))
     return torch.stack(pictures)

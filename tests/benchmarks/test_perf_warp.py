@@ -15,8 +15,8 @@ def test_reference_is_equal():
     query = orbit_camera(15.0, 48)
     drawn = splat_points(points, values, query)
     reference = splat_reference(points, values, query).permute(2, 0, 1)
-    assert torch.allclose(drawn.values, reference[:-1], atol=1e-4)
-    assert torch.allclose(drawn.weight, reference[-1], atol=1e-4)
+    assert torch.allclose(drawn[:-1], reference[:-1], atol=1e-4)
+    assert torch.allclose(drawn[-1], reference[-1], atol=1e-4)
 
 
 def test_rows_are_written_with_the_contract_columns(tmp_path):

@@ -25,15 +25,15 @@ def test_two_points_blend_by_kernel_and_depth():
     points = torch.stack([torch.tensor([3.5, 3.75]) * z, 3.5 * z, z], -1)
     drawn = splat_points(points, torch.tensor([[1.0], [0.0]]), pinhole())
     weight = 0.75 * torch.exp(torch.tensor(-DEPTH_SHARPNESS * 0.005))
-    assert torch.allclose(drawn.weight[3, 3], 1 + weight, atol=1e-4)
-    assert torch.allclose(drawn.values[0, 3, 3], 1 / (1 + weight), atol=1e-4)
-    assert drawn.weight[3, 5] == 0
+    assert torch.allclose(drawn[-1, 3, 3], 1 + weight, atol=1e-4)
+    assert torch.allclose(drawn[0, 3, 3], 1 / (1 + weight), atol=1e-4)
+    assert drawn[-1, 3, 5] == 0
 
 
 def test_nearer_point_hides_the_farther():
     points = torch.tensor([[7.0, 7.0, 2.0], [14.0, 14.0, 4.0]])
     drawn = splat_points(points, torch.tensor([[1.0], [9.0]]), pinhole())
-    assert drawn.values[0, 3, 3] == 1.0
+    assert drawn[0, 3, 3] == 1.0
 
 
 @pytest.mark.parametrize("channels", [1, 7, 12])
@@ -42,8 +42,8 @@ def test_torch_and_numba_agree(channels):
     camera = scenes.orbit_camera(20, size=48)
     compiled = splat_points(points, values, camera)
     vectorised = splat_points(points, values.clone().requires_grad_(), camera)
-    assert torch.allclose(compiled.values, vectorised.values, atol=1e-4)
-    assert torch.allclose(compiled.weight, vectorised.weight, atol=1e-4)
+    assert torch.allclose(compiled[:-1], vectorised[:-1], atol=1e-4)
+    assert torch.allclose(compiled[-1], vectorised[-1], atol=1e-4)
 
 
 @pytest.mark.skipif(
@@ -62,12 +62,12 @@ def test_same_bits_on_one_and_two_threads(size):
     finally:
         numba.set_num_threads(before)
     for result in results[1:]:
-        assert torch.equal(result.values, results[0].values)
-        assert torch.equal(result.weight, results[0].weight)
+        assert torch.equal(result[:-1], results[0][:-1])
+        assert torch.equal(result[-1], results[0][-1])
 
 
 def test_points_behind_the_camera_are_not_drawn():
     drawn = splat_points(
         torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 0.0]]), torch.ones(2, 3), pinhole()
     )
-    assert not drawn.weight.any()
+    assert not drawn[-1].any()

@@ -56,7 +56,7 @@ def test_clouds_that_are_drawn(gpu: torch.device) -> None:
     query = orbit_camera(15.0, SIZE)
     here = splat_points(points, values, query)
     there = splat_points(points.to(gpu), values.to(gpu), query.to(gpu))
-    assert differing(here.means, there.means, 1e-3) < 0.005
+    assert differing(here, there, 1e-3) < 0.005
 
 
 def test_normals(gpu: torch.device) -> None:

@@ -9,7 +9,7 @@ the method and own its constants; both give the same picture within rounding, an
 same bits for any number of threads.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -95,28 +95,14 @@ def compute_warp(batch: PairBatch, image_size: int | None = None) -> PairBatch:
     return reduce_batch(replace(batch, warp=warp), factor)
 
 
-@dataclass(frozen=True)
-class Splat:
-    """A drawn cloud; zero where nothing landed."""
-
-    means: Float[Tensor, "c1 h w"]
-    """The values, then the weight."""
-
-    @property
-    def values(self) -> Float[Tensor, "c h w"]:
-        """Means of what the points carry."""
-        return self.means[:-1]
-
-    @property
-    def weight(self) -> Float[Tensor, "h w"]:
-        """Σ b·e: bilinear coverage by the nearest surface."""
-        return self.means[-1]
-
-
 def splat_points(
     world_points: Float[Tensor, "n 3"], values: Float[Tensor, "n c"], camera: Camera
-) -> Splat:
-    """Draw a cloud of points as one (unbatched) camera sees it, each a bilinear dot."""
+) -> Float[Tensor, "c1 h w"]:
+    """Draw a cloud of points as one (unbatched) camera sees it, each a bilinear dot.
+
+    Means of the values, and as the last channel the weight Σ b·e, bilinear coverage by the nearest
+    surface; zero where nothing landed.
+    """
     pixels_from_world = camera.intrinsics @ camera.world_to_cam[:3]
     if needs_torch(world_points, values, pixels_from_world):
         points = _project(world_points, pixels_from_world)
@@ -130,7 +116,7 @@ def splat_points(
             camera.height,
             camera.width,
         )
-    return Splat(means[0])
+    return means[0]
 
 
 def _project(
