@@ -216,6 +216,10 @@ def _check_inputs(config: TrainConfig) -> None:
             f"inputs={config.inputs} and input_frames ({named} frames) are both given; give only "
             "one of them"
         )
+    if config.task == "complete" and (named or config.inputs) == 1:
+        raise InputError(
+            "one photograph does not show where its surfaces are; give at least two (inputs=3)"
+        )
 
 
 def sampler_for(options: SamplerOptions, model: ModelConfig) -> SamplerConfig:

@@ -57,7 +57,7 @@ class TrainerConfig:
         "computed",
         "frozen networks' part of a step: computed, cached by data_prep with model=, or auto: "
         "cached if it is there",
-        known=("computed", "cached", "auto"),
+        choices=("computed", "cached", "auto"),
     )
     compile: bool = option(
         False, "compile the denoiser: minutes at the start, faster steps on a GPU"
