@@ -12,7 +12,6 @@ from jaxtyping import Float
 from extrap_train.data.examples import Example, collate, query_batch
 from extrap_train.depth import require_depth
 from extrap_train.errors import InputError
-from extrap_train.geometry.orbits import turn_camera
 from extrap_train.geometry.resample import fill_holes
 from extrap_train.geometry.viewpoints import (
     camera_centers,
@@ -20,6 +19,7 @@ from extrap_train.geometry.viewpoints import (
     extra_references,
     pairwise_angles,
     scene_center,
+    turn_camera,
 )
 from extrap_train.geometry.warp import compute_warp
 from extrap_train.views import PairBatch, View, stack_cameras

@@ -11,8 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrap_train.figures import draw_contact_sheet, plot_cameras, save_figure, write_film
-from extrap_train.geometry.orbits import fit_circle
-from extrap_train.geometry.viewpoints import camera_centers, scene_center
+from extrap_train.geometry.viewpoints import camera_centers, fit_circle, scene_center
 from extrap_train.geometry.warp import splat_points
 from extrap_train.reconstruction.cloud import PointCloud
 from extrap_train.reconstruction.global_map import GlobalMap

@@ -13,11 +13,11 @@ from extrap_train.data.sequences import Frame
 from extrap_train.depth import RELIABLE_CONFIDENCE, DepthSource
 from extrap_train.errors import InputError, did_you_mean
 from extrap_train.geometry.cameras import WorldFrame
-from extrap_train.geometry.orbits import fit_circle
 from extrap_train.geometry.viewpoints import (
     camera_centers,
     facing,
     farthest_point_sample,
+    fit_circle,
     pairwise_angles,
     scene_center,
 )

@@ -6,8 +6,12 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from extrap_train.geometry.orbits import fit_circle
-from extrap_train.geometry.viewpoints import camera_centers, pairwise_angles, scene_center
+from extrap_train.geometry.viewpoints import (
+    camera_centers,
+    fit_circle,
+    pairwise_angles,
+    scene_center,
+)
 from extrap_train.geometry.warp import warp_references
 from extrap_train.reconstruction.global_map import GlobalMap
 from extrap_train.views import Camera, stack_cameras

@@ -20,12 +20,13 @@ from extrap_train.depth.sources import depth_source, source_of_generated
 from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.diffusion.packaged import packaged_name
 from extrap_train.errors import InputError
-from extrap_train.reconstruction.depth_prediction.calibration import DepthScores, calibrate
 from extrap_train.reconstruction.depth_prediction.depth_examples import MIN_FRAMES, draw_examples
 from extrap_train.reconstruction.depth_prediction.network import save_depth_network
 from extrap_train.reconstruction.depth_prediction.network_training import (
+    DepthScores,
     DepthTraining,
     StoredExamples,
+    calibrate,
     save_examples,
 )
 from extrap_train.runs import given_name

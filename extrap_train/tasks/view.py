@@ -26,7 +26,7 @@ from extrap_train.figures import (
     save_picture,
     write_film,
 )
-from extrap_train.geometry.orbits import MIN_VIEWS, orbit_cameras
+from extrap_train.geometry.viewpoints import MIN_VIEWS, orbit_cameras
 from extrap_train.metrics import psnr, quantised
 from extrap_train.store.manifest import claim
 from extrap_train.store.records import write_record

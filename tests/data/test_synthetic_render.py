@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from extrap_train.data.synthetic import build_scene, handheld_orbit, render
-from extrap_train.data.synthetic.light import Light
 from extrap_train.data.synthetic.material import (
     LocalPoints,
     Material,
@@ -14,7 +13,7 @@ from extrap_train.data.synthetic.material import (
     linear_to_srgb,
     srgb_to_linear,
 )
-from extrap_train.data.synthetic.parts import Part, SyntheticScene, placement
+from extrap_train.data.synthetic.parts import Light, Part, SyntheticScene, placement
 from extrap_train.data.synthetic.shapes import ellipsoid, flat_ground
 from extrap_train.geometry.cameras import project, unproject_to_world
 

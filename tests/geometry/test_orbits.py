@@ -5,8 +5,7 @@ import pytest
 import torch
 from orbits import even, ring
 
-from extrap_train.geometry.orbits import fit_circle, orbit_cameras
-from extrap_train.geometry.viewpoints import camera_centers, facing
+from extrap_train.geometry.viewpoints import camera_centers, facing, fit_circle, orbit_cameras
 from extrap_train.views import Camera
 
 

@@ -15,7 +15,6 @@ from extrap_train.depth.dataset import DatasetDepth
 from extrap_train.errors import InputError
 from extrap_train.geometry.visibility import Ball
 from extrap_train.reconstruction.completion import CompletionPipeline, add_view, map_of_inputs
-from extrap_train.reconstruction.depth_prediction.calibration import calibrate
 from extrap_train.reconstruction.depth_prediction.depth_examples import (
     MIN_FRAMES,
     DepthExamples,
@@ -37,6 +36,7 @@ from extrap_train.reconstruction.depth_prediction.network import (
 from extrap_train.reconstruction.depth_prediction.network_training import (
     DepthTraining,
     StoredExamples,
+    calibrate,
     loss_of,
     save_examples,
 )

@@ -12,7 +12,7 @@ from extrap_train.data.sequences import Frame, FrameSequence
 from extrap_train.data.synthetic.categories import build_scene
 from extrap_train.data.synthetic.parts import SyntheticScene
 from extrap_train.data.synthetic.render import render
-from extrap_train.geometry.orbits import looking_at
+from extrap_train.geometry.viewpoints import looking_at
 from extrap_train.views import Camera, View, WholePhotograph
 
 

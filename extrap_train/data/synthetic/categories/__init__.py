@@ -11,8 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from extrap_train.data.synthetic.light import draw_light
-from extrap_train.data.synthetic.parts import Part, SyntheticScene, placement
+from extrap_train.data.synthetic.parts import Part, SyntheticScene, draw_light, placement
 from extrap_train.data.synthetic.shapes import move_mesh
 from extrap_train.data.synthetic.surroundings import indoors, on_table, outdoors
 from extrap_train.errors import InputError
