@@ -284,7 +284,7 @@ class FilesDepthConfig(DepthConfig):
         "scene",
         "what is solved for: one scale per scene or per view, or, for files of inverse depth "
         "(affine), a scale and a shift per view",
-        known=("scene", "view", "affine"),
+        choices=("scene", "view", "affine"),
     )
     max_residual: float = option(
         0.1, "median relative difference from other views beyond which depth is refused", low=0

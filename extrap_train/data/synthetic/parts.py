@@ -1,5 +1,5 @@
-"""A synthetic scene: placed parts, merged into one ray-castable geometry, and their light: one sun (or
-lamp), a sky and what the ground throws back.
+"""A synthetic scene: placed parts, merged into one ray-castable geometry, and their light: one sun
+(or lamp), a sky and what the ground throws back.
 """
 
 from dataclasses import dataclass, field

@@ -60,7 +60,7 @@ class DepthNetwork(nn.Module):
     """A UNet on patches of 4 × 4 pixels; sides must be multiples of 32."""
 
     spread_factor: Tensor
-    """What the spreads are multiplied by, so that the confidence is true (`network_training.calibrate`)."""
+    """What the spreads are multiplied by, so that the confidence is true (`calibrate`)."""
 
     def __init__(self, widths: tuple[int, ...] = WIDTHS) -> None:
         super().__init__()
