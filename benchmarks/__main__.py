@@ -10,8 +10,7 @@ from pathlib import Path
 from benchmarks.catalogue import Catalogue, lpips_weights_of, require_only_output
 from extrap_train.command_line import option_rows
 from extrap_train.config import TableConfig
-from extrap_train.errors import InputError
-from extrap_train.exits import Ended, ends_in_one_line
+from extrap_train.errors import Ended, InputError, ends_in_one_line
 
 PERF_NAMES = ("align", "average", "gaussians", "prep", "sample", "stereo", "train", "warp")
 KINDS = ("methods", "tables", "categories")

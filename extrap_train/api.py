@@ -17,7 +17,7 @@ from extrap_train.config import (
 from extrap_train.data.examples import query_batch
 from extrap_train.data.scene_spec import open_scene
 from extrap_train.data.square_frames import input_views, select_input_frames
-from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth import DatasetDepth
 from extrap_train.depth.sources import depth_source
 from extrap_train.device import fastest_device
 from extrap_train.diffusion.generator import DiffusionGenerator

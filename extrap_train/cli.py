@@ -42,8 +42,7 @@ from extrap_train.config import (
     options_of,
     validate,
 )
-from extrap_train.errors import InputError
-from extrap_train.exits import ends_in_one_line
+from extrap_train.errors import InputError, ends_in_one_line
 from extrap_train.store import Outcome
 from extrap_train.terminal import terminal
 

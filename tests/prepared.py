@@ -7,7 +7,7 @@ from data_prep.preparation import prepare
 from extrap_train.config import PrepConfig
 from extrap_train.data.prepared import PreparedData
 from extrap_train.data.sequences import FrameSequence
-from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth import DatasetDepth
 
 
 def prepared_captures(

@@ -8,8 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
-from extrap_train.errors import InputError
-from extrap_train.exits import ends_in_one_line
+from extrap_train.errors import InputError, ends_in_one_line
 
 
 def _raise(error: BaseException) -> None:
@@ -53,7 +52,7 @@ def test_a_bug_keeps_its_traceback() -> None:
 
 
 _PRINTS = """
-from extrap_train.exits import ends_in_one_line
+from extrap_train.errors import ends_in_one_line
 with ends_in_one_line():
     for _ in range({count}):
         print("a line of sixty characters that a reader may not want to see")

@@ -14,7 +14,6 @@ _ORDER = (
     "extrap_train.views",
     "extrap_train.terminal",
     "extrap_train.store",
-    "extrap_train.exits",
     "extrap_train.config",
     "extrap_train.factories",
     "extrap_train.device",

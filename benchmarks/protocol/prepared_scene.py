@@ -35,8 +35,7 @@ from benchmarks.protocol.array_files import (
     sha256_of,
 )
 from benchmarks.protocol.draws import Draw, digest
-from extrap_train.depth import DepthMap
-from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth import DatasetDepth, DepthMap
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import atomic_folder
 from extrap_train.store.records import read_record

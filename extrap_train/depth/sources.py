@@ -18,8 +18,7 @@ from extrap_train.config import (
     required_file,
     required_folder,
 )
-from extrap_train.depth import DepthSource
-from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth import DatasetDepth, DepthSource
 from extrap_train.depth.files import FilesDepth
 from extrap_train.depth.mast3r.mast3r_checkpoint import read_network
 from extrap_train.depth.mast3r.source import Mast3rDepth

@@ -16,8 +16,7 @@ from lightning import LightningModule, Trainer
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch.callbacks import Callback
 
-from extrap_train.errors import InputError
-from extrap_train.exits import Terminated
+from extrap_train.errors import InputError, Terminated
 from extrap_train.store.atomic import atomic_file
 from extrap_train.weight_files import DAMAGE
 

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrap_train.config import SplatsConfig
-from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth import DatasetDepth
 from extrap_train.errors import InputError
 from extrap_train.figures import draw_contact_sheet, error_map
 from extrap_train.gaussians.fit import fit_views

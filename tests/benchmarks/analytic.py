@@ -6,7 +6,7 @@ import torch
 
 from benchmarks.methods.base import SceneInputs
 from extrap_train.data.sequences import Frame, FrameSequence
-from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth import DatasetDepth
 from extrap_train.views import View, stack_cameras
 from tests.scenes import Hit, Scene, orbit_camera, sphere
 

@@ -21,7 +21,7 @@ from extrap_train.data.frame_files import (
     write_frames,
 )
 from extrap_train.data.prepared import PreparedData
-from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth import DatasetDepth
 from extrap_train.errors import InputError
 
 SIZE = 16

@@ -10,7 +10,7 @@ from extrap_train.data.square_frames import (
     select_input_frames,
     target_views,
 )
-from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth import DatasetDepth
 from extrap_train.errors import InputError
 
 SCENE = capture(ring(even(12)))

@@ -22,8 +22,7 @@ from extrap_train.data.co3d import read_category
 from extrap_train.data.examples import ExampleReader
 from extrap_train.data.module import PairModule
 from extrap_train.data.prepared import PreparedData
-from extrap_train.depth import DepthMap
-from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth import DatasetDepth, DepthMap
 from extrap_train.diffusion.averaging import AveragedWeights
 from extrap_train.diffusion.model_files import initial_model
 from extrap_train.diffusion.training import CategoryTraining

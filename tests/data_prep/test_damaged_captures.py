@@ -25,8 +25,7 @@ from extrap_train.config import (
 )
 from extrap_train.data.prepared import PreparedData
 from extrap_train.data.square_frames import make_frames
-from extrap_train.depth import DepthMap
-from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth import DatasetDepth, DepthMap
 from extrap_train.errors import InputError
 from extrap_train.views import View
 

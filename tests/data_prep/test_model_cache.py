@@ -29,7 +29,7 @@ from extrap_train.config import (
 )
 from extrap_train.data.prepared import PreparedData
 from extrap_train.data.sequences import FrameSequence
-from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth import DatasetDepth
 from extrap_train.depth.mast3r.point_map_network import Architecture, PointMapNetwork
 from extrap_train.errors import InputError
 

@@ -19,7 +19,7 @@ from data_prep.prep_report import (
 from data_prep.preparation import prepare
 from extrap_train.config import FlowMatcherConfig, PrepConfig
 from extrap_train.data.prepared import Pairs, PreparedData
-from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth import DatasetDepth
 from extrap_train.matching.dense_flow import FlowMatcher
 
 

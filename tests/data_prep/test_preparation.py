@@ -20,8 +20,7 @@ from extrap_train.config import FlowMatcherConfig, PrepConfig
 from extrap_train.data import frame_files
 from extrap_train.data.prepared import PreparedData
 from extrap_train.data.square_frames import block_median, object_square
-from extrap_train.depth import DepthMap, DepthSource
-from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth import DatasetDepth, DepthMap, DepthSource
 from extrap_train.errors import InputError
 from extrap_train.jobs import Died
 from extrap_train.views import View

@@ -5,8 +5,7 @@ import torch
 from traced_scenes import SCENES, orbit_camera, render
 
 from extrap_train.config import DatasetDepthConfig, DepthConfig, StereoConfig
-from extrap_train.depth import DepthSource
-from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth import DatasetDepth, DepthSource
 from extrap_train.depth.sources import depth_source
 from extrap_train.depth.stereo import PlaneSweepStereo
 from extrap_train.errors import InputError

@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from benchmarks.methods.threedgs import AffineSurrogate
-from extrap_train.depth import DepthSource
-from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth import DatasetDepth, DepthSource
 from extrap_train.errors import InputError
 from extrap_train.views import View
 from tests.scenes import SPHERE, orbit_camera

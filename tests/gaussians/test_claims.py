@@ -19,7 +19,7 @@ from benchmarks.methods.fsgs import Fsgs
 from benchmarks.methods.instantsplat import InstantSplat
 from benchmarks.methods.threedgs import ThreeDgs
 from extrap_train.data.synthetic import build_scene, handheld_orbit, render
-from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth import DatasetDepth
 from extrap_train.geometry.viewpoints import camera_centers, farthest_point_sample
 from extrap_train.geometry.warp import warp_references
 from extrap_train.metrics import psnr, quantised

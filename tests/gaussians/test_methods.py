@@ -13,8 +13,7 @@ from benchmarks.methods.dngaussian import DnGaussian
 from benchmarks.methods.fsgs import Fsgs
 from benchmarks.methods.instantsplat import InstantSplat
 from benchmarks.methods.threedgs import ThreeDgs
-from extrap_train.depth import DepthMap
-from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth import DatasetDepth, DepthMap
 from extrap_train.errors import InputError
 from extrap_train.gaussians.fit import Diverged, Fit, fit, fit_views
 from extrap_train.gaussians.gaussian_options import GaussianOptions, exponential

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from benchmarks.methods.fsgs import Fsgs, FsgsRecipe
-from extrap_train.depth import DepthMap
-from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth import DatasetDepth, DepthMap
 from extrap_train.errors import InputError
 from extrap_train.gaussians.density import GrowthStatistics
 from extrap_train.gaussians.gaussian_options import Schedule

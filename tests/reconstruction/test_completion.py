@@ -9,8 +9,7 @@ import torch
 
 from extrap_train.config import CompletionConfig, ConfidenceConfig
 from extrap_train.data.examples import query_batch
-from extrap_train.depth import RELIABLE_CONFIDENCE, DepthMap, PointMaps, point_maps_of
-from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth import RELIABLE_CONFIDENCE, DatasetDepth, DepthMap, PointMaps, point_maps_of
 from extrap_train.diffusion.generator import GeneratedViews
 from extrap_train.errors import InputError
 from extrap_train.geometry.viewpoints import pairwise_angles, scene_center

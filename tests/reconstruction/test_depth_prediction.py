@@ -11,7 +11,7 @@ from in_process import run_command
 from extrap_train.__main__ import main
 from extrap_train.config import CompletionConfig, TrainerConfig
 from extrap_train.data.sequences import Frame
-from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth import DatasetDepth
 from extrap_train.errors import InputError
 from extrap_train.geometry.visibility import Ball
 from extrap_train.reconstruction.completion import CompletionPipeline, add_view, map_of_inputs

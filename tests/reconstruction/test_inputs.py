@@ -9,7 +9,7 @@ import torch
 from orbits import even, ring
 
 from extrap_train.data.sequences import Frame
-from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth import DatasetDepth
 from extrap_train.errors import InputError
 from extrap_train.geometry.viewpoints import scene_center
 from extrap_train.reconstruction.capture_check import check_poses

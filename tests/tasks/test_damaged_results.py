@@ -23,7 +23,7 @@ from data_prep.preparation import prepare
 from extrap_train.config import LoraConfig, ModelConfig, PrepConfig, UNetConfig
 from extrap_train.data.co3d import read_category
 from extrap_train.data.prepared import PreparedData
-from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth import DatasetDepth
 from extrap_train.diffusion.lora import AdapterOrigin, add_adapter, load_adapter, save_adapter
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.errors import InputError

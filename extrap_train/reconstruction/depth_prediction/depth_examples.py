@@ -13,8 +13,7 @@ from torch.nn import functional
 
 from extrap_train.config import CompletionConfig, ConfidenceConfig
 from extrap_train.data.sequences import Frame
-from extrap_train.depth import DepthSource
-from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth import DatasetDepth, DepthSource
 from extrap_train.diffusion.generator import ViewGenerator
 from extrap_train.geometry.cameras import WorldFrame
 from extrap_train.reconstruction.completion import CompletionPipeline, complete, map_of_inputs

@@ -21,7 +21,7 @@ from extrap_train.data.examples import ExampleReader
 from extrap_train.data.feature_files import FeatureFiles
 from extrap_train.data.module import TrainingBatches
 from extrap_train.data.prepared import PreparedData
-from extrap_train.depth.dataset import DatasetDepth
+from extrap_train.depth import DatasetDepth
 from extrap_train.diffusion.encoders import Frozen
 from extrap_train.diffusion.frozen_features import frame_encoder
 from extrap_train.diffusion.loss import diffusion_loss
