@@ -88,7 +88,9 @@ class ThreeDgs(GaussianOptions):
     """What the method does in the training loop."""
 
     rasterizer: str = option(
-        "auto", "numba on the CPU, gsplat on a GPU; auto: gsplat if there is a GPU", known=_CHOICES
+        "auto",
+        "numba on the CPU, gsplat on a GPU; auto: gsplat if there is a GPU",
+        choices=_CHOICES,
     )
 
     def __post_init__(self) -> None:
