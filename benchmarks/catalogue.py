@@ -16,6 +16,7 @@ from extrap_train.command_line import CommandLine, CommandOptions, choices_of, o
 from extrap_train.config import (
     LPIPS_NETS,
     METRICS,
+    DatasetDepthConfig,
     DepthConfig,
     MethodConfig,
     MetricConfig,
@@ -110,6 +111,11 @@ class Catalogue:
         except (HydraException, OmegaConfBaseException) as error:
             raise InputError(f"rules.depth={name}: {explain(error, PREP, words)}") from None
         assert isinstance(composed, DepthConfig)
+        if isinstance(composed, DatasetDepthConfig) and name != "dataset":
+            raise InputError(
+                f"rules.depth={name}: is the data set's depth under another name; give "
+                "rules.depth=dataset, which marks the table as an oracle"
+            )
         check_options(composed, "depth.")
         return composed
 

@@ -45,7 +45,7 @@ from benchmarks.run.plan import (
 )
 from benchmarks.run.run_method import check_output, run_method
 from benchmarks.score.scoring import missing_networks
-from extrap_train.config import MethodConfig, TableConfig
+from extrap_train.config import FilesDepthConfig, MethodConfig, TableConfig
 from extrap_train.errors import InputError
 from extrap_train.jobs import Died, Launcher
 from extrap_train.jobs.isolated import IsolatedJob, IsolatedLauncher
@@ -111,11 +111,11 @@ def _run(
     require_different(configs)
     if not configs:
         raise InputError("the table has no methods: give methods=[...]")
+    depth = catalogue.depth(table.rules.depth)
     protocol, captures = open_protocol(table, folder, configs)
     draws = selected_draws(table, protocol, options.quick)
     isolated = _isolated_launcher(configs, table, options)
     contents = method_contents(configs, {draw.category for draw in draws}, isolated)
-    depth = catalogue.depth(table.rules.depth)
     scenes: list[Scene] = []
     with progress("preparing", len(draws), "draws") as bar:
         for scene in prepare_draws(table, folder, draws, captures, depth):
@@ -135,6 +135,7 @@ def _run(
         scored_from=jobs[0].scored_from,
         methods={config.name: config for config in configs},
         cells=[job.folder.name for job in jobs],
+        depth_from_files=isinstance(depth, FilesDepthConfig),
     )
     try:
         with _launchers(isolated, options.launcher, len(jobs)) as (making, scoring):

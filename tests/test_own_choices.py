@@ -127,6 +127,14 @@ def test_a_table_takes_a_depth_source_from_a_folder(own: Path) -> None:
     assert [path.name for path in weight_files(config)] == ["own_flat.py"]
 
 
+def test_a_table_knows_the_data_sets_depth_by_one_name(own: Path) -> None:
+    """By another one, the table would not be marked as an oracle."""
+    (own / "depth" / "truth.yaml").write_text("defaults: [dataset_schema, _self_]\nname: truth\n")
+    with pytest.raises(InputError, match=r"rules\.depth=dataset"):
+        Catalogue.with_own([str(own)]).depth("truth")
+    assert Catalogue().depth("dataset").name == "dataset"
+
+
 def test_monocular_depth_takes_a_matcher_from_a_folder(own: Path) -> None:
     config = Catalogue.with_own([str(own)]).depth("mono")
     assert isinstance(config, MonocularConfig)

@@ -82,7 +82,8 @@ def _scene(
         raise InputError(
             f"{draw.category}/{draw.sequence}: has no frame {missing[0]}, which the protocol names"
         )
-    photographs = [frames[name].load() for name in draw.inputs]
+    is_oracle = isinstance(depth, DatasetDepthConfig)  # no other source sees the data set's depth
+    photographs = [frames[name].load(depth=is_oracle) for name in draw.inputs]
     fine_size = size * _fine_scale(photographs, rules)
     inputs, seconds = _with_depth(photographs, depth, fine_size)
     targets = [frames[name].load().squared(size) for name in draw.targets]

@@ -147,6 +147,8 @@ def _title(results: Results) -> str:
     depth = f"depth estimated from the inputs ({table.rules.depth})"
     if table.rules.is_oracle:
         depth = "oracle: depth of the data set"
+    elif results.plan.depth_from_files:
+        depth = f"depth from files ({table.rules.depth}), which may know more than the inputs"
     quick = " (quick: a part of the table)" if results.plan.quick else ""
     return one_line(f"{table.title or table.name}; {depth}{quick}")
 
@@ -266,6 +268,9 @@ def _notes(results: Results) -> list[str]:
     return [
         f"Protocol {protocol[:16]}: {rules.pool} frames by farthest-point sampling, "
         f"{rules.image_size} × {rules.image_size} px, depth of the inputs: {rules.depth}.",
+        "Masked columns are over the pixels that the warp of the inputs by this depth reaches, "
+        "unseen ones over the others. With another depth these are other pixels, so compare only "
+        "the other columns then.",
         "Best bold, second underlined; ° marks what cannot be told from the best (sign-flip test "
         "of the paired differences over captures, p above 5 %; below "
         f"{FEWEST_CAPTURES} captures nothing can). A mean that lacks cells says how many it has of "

@@ -114,6 +114,8 @@ class Plan:
     scored_from: Manifest
     methods: dict[str, MethodConfig]
     cells: Annotated[list[FileName], AfterValidator(_all_different)]
+    depth_from_files: bool = False
+    """Whether another program made the inputs' depth, which may have seen the targets."""
 
 
 def read_cell(folder: Path) -> Cell | None:

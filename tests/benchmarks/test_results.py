@@ -1,5 +1,7 @@
 """Intervals, ranks and paired differences, against what is known of the numbers."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -126,6 +128,15 @@ def test_a_panel_says_over_how_many_captures() -> None:
     assert enough.rows[0].entries[0].title == f"95 % interval 30.54 to 34.46 {spread}"
     one = lay_out(results(cell("a", "0", 0, 30.0)), None).panels[0]
     assert one.rows[0].entries[0].title == "no interval: a single capture, 1 cells"
+
+
+def test_depth_from_files_is_not_said_to_come_from_the_inputs() -> None:
+    table = results(cell("a", "0", 0, 30.0))
+    assert "estimated from the inputs" in lay_out(table, None).title
+    table = replace(table, plan=replace(table.plan, depth_from_files=True))
+    title = lay_out(table, None).title
+    assert "from files" in title
+    assert "estimated" not in title
 
 
 def test_what_was_given_is_said_of_everycell() -> None:

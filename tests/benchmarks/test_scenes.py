@@ -11,7 +11,7 @@ from benchmarks.protocol.captures import Capture
 from benchmarks.protocol.draws import Draw, draw_sequence
 from benchmarks.protocol.prepared_scene import Scene, truths_removed
 from benchmarks.protocol.scene_writing import prepare_scene
-from extrap_train.config import DatasetDepthConfig, RulesConfig
+from extrap_train.config import DatasetDepthConfig, OwnDepthConfig, RulesConfig
 from extrap_train.errors import InputError
 from extrap_train.metrics import psnr
 from tests.benchmarks.analytic import analytic_capture
@@ -50,6 +50,15 @@ def test_inputs_are_the_photographs_with_depth(draw_and_scene: tuple[Draw, Scene
             torch.testing.assert_close(view.camera.world_to_cam, true.camera.world_to_cam)
             torch.testing.assert_close(view.camera.intrinsics, true.camera.intrinsics)
     assert inputs.targets.world_to_cam.shape == (6, 4, 4)
+
+
+def test_only_an_oracle_is_given_the_data_sets_depth(tmp_path: Path) -> None:
+    """A source of one's own that reads the views' depth finds none."""
+    capture = Capture(analytic_capture(size=32))
+    draw = draw_sequence("apple", "one", *_frames(capture.sequence), _RULES)[0]
+    config = OwnDepthConfig(name="peek", factory="extrap_train.depth.dataset.DatasetDepth")
+    with pytest.raises(InputError, match="depth"):
+        prepare_scene(tmp_path / "scenes" / "draw", capture, draw, _RULES, config, "origin")
 
 
 def test_a_method_needs_no_file_of_the_truth(draw_and_scene: tuple[Draw, Scene]) -> None:
