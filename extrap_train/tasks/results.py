@@ -38,11 +38,12 @@ def write_results(
     number is none.
     """
     config, scores = measured.config, measured.scores()
-    if (start := _start_scores(folder)) is not None:
-        if set(start["view"]) == set(scores["view"]):
+    if (before := _start_scores(folder)) is not None:
+        if _are_measured_alike(before, scores):
+            start = before[before["method"] == "model"].assign(method="start")
             scores = pd.concat([scores, start], ignore_index=True)
         else:
-            missing = missing | {"start": "was measured on other held-out views"}
+            missing = missing | {"start": "was measured on other views or with another LPIPS"}
     missing = missing_scores(missing)
     _require_finite(scores, missing)
     validation = summarise(scores)
@@ -67,9 +68,24 @@ def write_results(
 
 
 def keep_start_scores(scores: pd.DataFrame, folder: RunFolder) -> None:
-    """Keep how the model of a run scores before its first step, for `write_results`."""
-    start = scores[scores["method"] == "model"].assign(method="start")
-    write_atomic(folder.path / _START, start.to_csv(index=False).encode())
+    """Keep how the model of a run scores before its first step, for `write_results`; beside it how
+    the nearest photographs do, which no training changes.
+    """
+    kept = scores[scores["method"].isin(["model", _UNCHANGED])]
+    write_atomic(folder.path / _START, kept.to_csv(index=False).encode())
+
+
+def _are_measured_alike(before: pd.DataFrame, now: pd.DataFrame) -> bool:
+    """Whether both tables give the same views' nearest photographs the same scores, but for what
+    another machine rounds.
+    """
+    first, second = (
+        table[table["method"] == _UNCHANGED].drop(columns="method").set_index("view").sort_index()
+        for table in (before, now)
+    )
+    return first.index.equals(second.index) and np.allclose(
+        first.reindex(columns=second.columns), second, rtol=0.01, equal_nan=True
+    )
 
 
 def _start_scores(folder: RunFolder) -> pd.DataFrame | None:
@@ -79,7 +95,7 @@ def _start_scores(folder: RunFolder) -> pd.DataFrame | None:
         return None
     try:
         table = pd.read_csv(file)
-        table["view"], table["method"]
+        table.drop(columns=["view", "method"]).astype(float)
     except (ValueError, KeyError) as error:
         raise InputError(f"{file}: damaged ({error}); delete it to go on without it") from None
     return table
@@ -92,6 +108,7 @@ def print_places(folder: RunFolder, console: Console) -> None:
 
 _NO_OBJECT = "no held-out view shows the object"
 _START = "start.csv"
+_UNCHANGED = "nearest"
 _WITHOUT_PIXELS = {
     "psnr_holes": "no held-out view has a pixel that no reference shows",
     "psnr_warped": "no held-out view has a pixel that a reference shows",
