@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,8 +17,10 @@ _BYTES = 4
 """Of a number: weights, moments and averages are kept in single precision."""
 _CHECKPOINTS = 3
 """At a time on disk: two are kept while a third is written."""
-_LIMITS = ("memory.max", "memory/memory.limit_in_bytes")
-"""Files below `_CGROUPS` with the limit of this process's control group, of both versions."""
+_LIMITS = {"": ("", "memory.max"), "memory": ("memory", "memory.limit_in_bytes")}
+"""Folder of control groups below `_CGROUPS` and the file with a group's limit, of both versions: by
+the controllers that `/proc/self/cgroup` names, none in version 2.
+"""
 _CGROUPS = Path("/sys/fs/cgroup")
 _PROC = Path("/proc")
 
@@ -76,8 +79,21 @@ def free_memory(device: torch.device) -> int:
     if not _PROC.is_dir():  # not Linux, and nobody says how much of it is free
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     machine, own = (_sizes(_PROC / name) for name in ("meminfo", "self/status"))
-    limits = [text for name in _LIMITS if (text := _read(_CGROUPS / name)).isdigit()]
-    return min([machine["MemAvailable"] + own["VmRSS"], *map(int, limits)])
+    return min([machine["MemAvailable"] + own["VmRSS"], *_group_limits()])
+
+
+def _group_limits() -> Iterator[int]:
+    """Limits of the control groups of this process, each within the one before it.
+
+    A container sees its own as the root, a SLURM job its own further down.
+    """
+    for line in _read(_PROC / "self/cgroup").splitlines():
+        _, controllers, group = line.split(":", 2)
+        if controllers in _LIMITS:
+            below, name = _LIMITS[controllers]
+            place = _CGROUPS / below / group.lstrip("/")
+            limits = (_read(each / name) for each in (place, *place.parents))
+            yield from (int(limit) for limit in limits if limit.isdigit())
 
 
 def _read(file: Path) -> str:

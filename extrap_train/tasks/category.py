@@ -84,14 +84,12 @@ def run(config: TrainConfig, prepare: Prepare) -> Outcome:
     seconds = {"prepare": time.perf_counter() - started}
     manifest = run_manifest(config, prepared)
     require_unseen(config.model.start, manifest)
-    with _open_run(folder, config, manifest, console) as opening:
+    footprint = Footprint.of(model, config.trainer)
+    with _open_run(folder, config, manifest, footprint, console) as opening:
         if opening.is_finished:
             steps = Finished.read(folder).steps
             console.print(f"already trained for {steps} steps: {folder.path}")
         else:
-            console.print(
-                require_room(Footprint.of(model, config.trainer), config.trainer, folder.path)
-            )
             training = CategoryTraining(model, config, data.validation_names(), distance)
             with open_logger(config, folder) as loggers:
                 _train(training, data, opening.checkpoint, folder, seconds, loggers)
@@ -108,9 +106,17 @@ def run(config: TrainConfig, prepare: Prepare) -> Outcome:
 
 @contextmanager
 def _open_run(
-    folder: RunFolder, config: TrainConfig, manifest: Manifest, console: Console
+    folder: RunFolder,
+    config: TrainConfig,
+    manifest: Manifest,
+    footprint: Footprint,
+    console: Console,
 ) -> Iterator[Opening]:
-    """The run, closed to other commands; the first process opens it, the others follow."""
+    """The run, closed to other commands; the first process opens it, the others follow.
+
+    Only the first measures what is free: the GPU that is asked is its own, and of the others each
+    would keep a context there.
+    """
     meet()
     if not is_first():
         yield join(folder.path)
@@ -121,6 +127,7 @@ def _open_run(
             claimed.begin()
         opening = _find_opening(folder, config, console)
         if not opening.is_finished:
+            console.print(require_room(footprint, config.trainer, folder.path))
             write_options(folder, config, at_least=_resumed_step(opening.checkpoint))
         point_latest(folder)
         announce(folder.path, opening)
