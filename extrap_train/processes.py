@@ -2,6 +2,7 @@
 others join it.
 """
 
+import atexit
 import os
 import time
 from dataclasses import dataclass, field
@@ -47,10 +48,11 @@ def is_first() -> bool:
 def meet() -> None:
     """Let the processes of a torchrun meet: by its variables one launch looks like another.
 
-    Lightning takes the group that it finds.
+    Lightning takes the group that it finds, and then leaves its end to us.
     """
     if "TORCHELASTIC_RUN_ID" in os.environ and not dist.is_initialized():
         dist.init_process_group()
+        atexit.register(dist.destroy_process_group)
 
 
 def announce(folder: Path, opening: Opening) -> None:
@@ -64,17 +66,18 @@ def announce(folder: Path, opening: Opening) -> None:
 def join(folder: Path, wait_s: float = _WAIT_S) -> Opening:
     """What the first process of this launch has found; waits until it has.
 
-    Raises InputError where it has not within `wait_s`.
+    Raises InputError where it has not within `wait_s`, or has ended instead.
     """
-    ends = time.monotonic() + wait_s
+    unopened = f"{folder}: has not been opened by the first process of this launch"
     if dist.is_initialized():
-        return cast(Opening, _broadcast(None))
+        try:
+            return cast(Opening, _broadcast(None))
+        except RuntimeError:  # of a connection that was closed, or of a group that waited too long
+            raise InputError(f"{unopened}; see what that one says") from None
+    ends = time.monotonic() + wait_s
     while (opening := _read_announced(folder)) is None:
         if time.monotonic() >= ends:
-            raise InputError(
-                f"{folder}: has not been opened by the first process of this launch in "
-                f"{wait_s:.0f} s; see what that one says"
-            )
+            raise InputError(f"{unopened} in {wait_s:.0f} s; see what that one says")
         time.sleep(_LOOK_EVERY_S)
     return opening
 

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import pandas as pd
 import pytest
+import torch.distributed as dist
 from hydra.types import RunMode
 from tiny_job import TINY
 
@@ -111,6 +112,20 @@ def test_the_others_join_the_launch_that_opened_the_run(
     monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
     with pytest.raises(InputError, match="has not been opened"):
         join(tmp_path, wait_s=0.0)
+
+
+def test_the_others_end_in_a_line_where_the_first_ends_without_opening(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a torchrun's second process hears it."""
+
+    def closed(values: list[object], **options: object) -> None:
+        raise RuntimeError("Connection closed by peer")
+
+    monkeypatch.setattr(dist, "is_initialized", lambda: True)
+    monkeypatch.setattr(dist, "broadcast_object_list", closed)
+    with pytest.raises(InputError, match=str(tmp_path)):
+        join(tmp_path)
 
 
 @pytest.mark.parametrize(
