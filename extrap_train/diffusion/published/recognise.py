@@ -46,7 +46,7 @@ def recognise_config(path: Path, option: str) -> ModelConfig:
     config = family_config(published_family(file, unet))
     try:
         _set_sizes(config, unet, vae, clip)
-    except (LookupError, ValueError, StopIteration):
+    except (LookupError, ValueError, ArithmeticError, StopIteration):
         raise file.refusal(f"its size cannot be recognised: {cause}") from None
     try:
         validate_model(config)

@@ -135,7 +135,7 @@ def _mapped(file: Path) -> list[range]:
     return [range(int(low, 16), int(high, 16)) for low, high in spans]
 
 
-@pytest.mark.parametrize("kind", ["text", "small", "cut", "tensorless", "huge"])
+@pytest.mark.parametrize("kind", ["text", "small", "cut", "tensorless", "huge", "empty"])
 def test_what_is_no_such_checkpoint_is_refused_and_leaves_nothing(
     references: dict[str, Reference], tmp_path: Path, kind: str
 ) -> None:
@@ -149,6 +149,8 @@ def test_what_is_no_such_checkpoint_is_refused_and_leaves_nothing(
         state = {"model.diffusion_model.x": torch.zeros(1)}
     elif kind == "huge":
         state["first_stage_model.encoder.down.9999999.block.0.conv1.weight"] = torch.zeros(1)
+    elif kind == "empty":
+        state["cond_stage_model.model.visual.class_embedding"] = torch.zeros(0)
     file = tmp_path / "x.ckpt"
     torch.save({"state_dict": state}, file)
     if kind == "cut":
