@@ -6,7 +6,6 @@ from multiprocessing.context import ForkServerContext
 from pathlib import Path
 
 import pytest
-from PIL import Image
 
 from benchmarks.catalogue import Catalogue
 from benchmarks.protocol.captures import freeze, open_captures
@@ -14,11 +13,9 @@ from benchmarks.report.aggregate import read_results
 from benchmarks.run.plan import TableFolder
 from benchmarks.run_table import RunOptions, run_table
 from extrap_train.config import CapturesConfig, RulesConfig
-from extrap_train.data.image_files import to_eight_bits
 from extrap_train.errors import InputError
-from extrap_train.geometry.foreign_cameras import opengl_from_world_to_cam
 from extrap_train.jobs.local import LocalLauncher
-from tests.benchmarks.analytic import view_at
+from tests.benchmarks.split_folders import write_split
 
 _SIZE, _COUNT = 24, 8
 _RULES = RulesConfig(image_size=_SIZE, views=[3], draws=["given"], depth="stereo")
@@ -26,26 +23,7 @@ _RULES = RulesConfig(image_size=_SIZE, views=[3], draws=["given"], depth="stereo
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """One scene; its transforms.json lists the frames backwards."""
-    folder = tmp_path / "split" / "34_1479_4753"
-    (folder / "images").mkdir(parents=True)
-    frames = []
-    for index in range(_COUNT):
-        view = view_at(360 * index / _COUNT, _SIZE)
-        image = Image.fromarray(to_eight_bits(view.image.permute(1, 2, 0)))
-        image.save(folder / "images" / f"frame{index:06d}.png")
-        frames.append(
-            {
-                "file_path": f"images/frame{index:06d}.png",
-                "transform_matrix": opengl_from_world_to_cam(view.camera.world_to_cam).tolist(),
-            }
-        )
-    k = view.camera.intrinsics
-    lens = {"fl_x": k[0, 0].item(), "fl_y": k[1, 1].item(), "cx": _SIZE / 2, "cy": _SIZE / 2}
-    content = {**lens, "w": _SIZE, "h": _SIZE, "frames": frames[::-1]}
-    (folder / "transforms.json").write_text(json.dumps(content))
-    split = {"train_ids": [0, 2, 5], "test_ids": [1, 7]}
-    (folder / "train_test_split_3.json").write_text(json.dumps(split))
+    write_split(tmp_path / "split", _SIZE, _COUNT)
     return tmp_path / "split"
 
 
