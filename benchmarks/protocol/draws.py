@@ -1,6 +1,7 @@
 """Which frames are inputs and which are targets: drawn once, written down, hashed.
 
-Farthest-point sampling picks a pool of nine frames; 3 or 6 of them are inputs, the rest targets.
+Farthest-point sampling picks a pool of nine frames; 3 or 6 of them are inputs, the rest targets. Of
+`halves`, inputs and targets are from two halves of the capture instead.
 """
 
 import hashlib
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from extrap_train.config import RulesConfig
 from extrap_train.data.json_files import read_json
@@ -110,13 +111,66 @@ def draw_sequence(
     draws = []
     for kind in rules.draws:
         for seed in rules.seeds:
-            order = _ORDERS[kind](angles, _generator(seed, category, sequence))
+            random = _generator(seed, category, sequence)
+            if kind == "halves":
+                draws += _halves(category, sequence, names, cameras, rules, seed, random)
+                continue
+            order = _ORDERS[kind](angles, random)
             for n_views in rules.views:
                 chosen = set(order[:n_views])
                 inputs = tuple(names[pool[i]] for i in range(len(pool)) if i in chosen)
                 targets = tuple(names[pool[i]] for i in range(len(pool)) if i not in chosen)
                 draws.append(Draw(category, sequence, n_views, kind, seed, inputs, targets))
     return draws
+
+
+def _halves(
+    category: str,
+    sequence: str,
+    names: Sequence[str],
+    cameras: Camera,
+    rules: RulesConfig,
+    seed: int,
+    random: np.random.Generator,
+) -> list[Draw]:
+    """Inputs from one half of the capture, targets from the other (as ArtiFixer evaluates).
+
+    The two cameras that are farthest apart in angle are the poles; a half is the frames nearer to
+    its pole. Farthest-point sampling from the poles picks the inputs, and as many targets as the
+    pool would leave of the fewest inputs, the same for every number of inputs.
+    """
+    angles = pairwise_angles(cameras, scene_center(cameras))
+    poles = np.unravel_index(angles.argmax(), angles.shape)
+    near, far = random.permutation(poles)
+    is_near = angles[near] <= angles[far]
+    ours, theirs = np.flatnonzero(is_near), np.flatnonzero(~is_near)
+    most = max(rules.views)
+    if len(ours) < most or not len(theirs):
+        raise InputError(
+            f"{category}/{sequence}: its halves have {len(ours)} and {len(theirs)} frames, and "
+            f"{most} inputs come from one; leave it out, or give smaller rules.views="
+        )
+    positions = camera_centers(cameras)
+
+    def pick(half: Int[np.ndarray, " m"], pole: int, count: int) -> list[int]:
+        start = int(np.flatnonzero(half == pole)[0])
+        chosen = farthest_point_sample(positions[half], min(count, len(half)), start)
+        return [int(index) for index in half[chosen]]
+
+    order = pick(ours, int(near), most)
+    targets = sorted(pick(theirs, int(far), rules.pool - min(rules.views)))
+    return [
+        Draw(
+            category,
+            sequence,
+            n_views,
+            "halves",
+            seed,
+            inputs=tuple(names[index] for index in sorted(order[:n_views])),
+            targets=tuple(names[index] for index in targets),
+        )
+        for n_views in rules.views
+    ]
 
 
 def farthest_frames(cameras: Camera, count: int) -> list[int]:

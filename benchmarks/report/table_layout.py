@@ -265,8 +265,11 @@ def _missing(results: Results) -> list[str]:
 def _notes(results: Results) -> list[str]:
     times = {entry.title: entry.time for entry in results.methods.values()}
     protocol, rules = results.plan.protocol, results.plan.table.rules
+    frames = f"{rules.pool} frames by farthest-point sampling"
+    if "halves" in results.plan.table.draws:
+        frames += " (halves: inputs in one half of the capture, targets in the other)"
     return [
-        f"Protocol {protocol[:16]}: {rules.pool} frames by farthest-point sampling, "
+        f"Protocol {protocol[:16]}: {frames}, "
         f"{rules.image_size} × {rules.image_size} px, depth of the inputs: {rules.depth}.",
         "Masked columns are over the pixels that the warp of the inputs by this depth reaches, "
         "unseen ones over the others. With another depth these are other pixels, so compare only "

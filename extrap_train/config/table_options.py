@@ -8,7 +8,7 @@ from extrap_train.config.commands import SlurmConfig
 from extrap_train.config.options import MISSING, option
 
 CAPTURE_SOURCES = ("synthetic", "co3d", "reconfusion", "scenes")
-DRAWS = ("random", "spread", "one_sided", "given")
+DRAWS = ("random", "spread", "one_sided", "halves", "given")
 LPIPS_NETS = ("alex", "vgg", "squeeze")
 _SSIM_WINDOW = 11
 _HIGHER_IS_BETTER = (
@@ -99,7 +99,8 @@ class RulesConfig:
     )
     draws: list[str] = option(
         ["random", "spread", "one_sided"],
-        "how the inputs may be drawn from the pool",
+        "how the inputs may be drawn from the pool; halves: inputs from one half of the capture, "
+        "targets from the other",
         is_set=True,
         choices=DRAWS,
     )

@@ -77,6 +77,44 @@ def test_one_sided_inputs_are_neighbours_about_the_scene() -> None:
             assert angles[np.ix_(chosen, chosen)].max() <= math.radians(100)
 
 
+_HALVES = RulesConfig(draws=["halves"], seeds=[0, 1])
+
+
+@pytest.mark.parametrize("sequence", ["one", "two", "three", "four"])
+def test_halves_are_disjoint_in_angle(sequence: str) -> None:
+    """Around the ring, all inputs come one after another, and so do all targets."""
+    draws = _draws(sequence, _HALVES)
+    assert draws == _draws(sequence, _HALVES)
+    assert [(d.draw, d.seed, d.n_views) for d in draws] == [
+        ("halves", seed, n) for seed in (0, 1) for n in (3, 6)
+    ]
+    for draw in draws:
+        assert (len(draw.inputs), len(draw.targets)) == (draw.n_views, 6)
+        around = [name in draw.inputs for name in sorted({*draw.inputs, *draw.targets})]
+        changes = sum(a != b for a, b in zip(around, [*around[1:], around[0]], strict=True))
+        assert changes == 2
+    three, six = (next(d for d in draws if d.n_views == n) for n in (3, 6))
+    assert set(three.inputs) < set(six.inputs)
+    assert three.targets == six.targets
+
+
+def test_halves_divide_the_frames_by_the_farthest_pair() -> None:
+    """On an arc, too, where the poles are its ends."""
+    cameras = ring(even(36))[torch.arange(18)]
+    for seed in range(4):
+        rules = RulesConfig(draws=["halves"], seeds=[seed])
+        for draw in draw_sequence("apple", "arc", _NAMES[:18], cameras, rules):
+            sides = [{int(n[:3]) < 9 for n in part} for part in (draw.inputs, draw.targets)]
+            assert [len(side) for side in sides] == [1, 1]
+            assert sides[0] != sides[1]
+
+
+def test_a_half_of_too_few_frames_is_named() -> None:
+    rules = RulesConfig(draws=["halves"], views=[8])
+    with pytest.raises(InputError, match=r"apple/short: its halves have.*rules\.views"):
+        draw_sequence("apple", "short", _NAMES[:10], _CAMERAS[torch.arange(10)], rules)
+
+
 def test_draws_depend_on_capture_and_seed_alone() -> None:
     assert _draws() == _draws()
     random = {d.seed: d.inputs for d in _draws() if d.draw == "random" and d.n_views == 3}
