@@ -20,6 +20,7 @@ from extrap_train.config import (
     metric_direction,
 )
 from extrap_train.depth import DepthSource
+from extrap_train.depth.files import FilesDepth
 from extrap_train.depth.sources import depth_source, weight_files
 from extrap_train.errors import InputError
 from extrap_train.matching.matchers import matcher
@@ -140,6 +141,12 @@ def test_monocular_depth_takes_a_matcher_from_a_folder(own: Path) -> None:
     assert isinstance(config, MonocularConfig)
     assert isinstance(config.matcher, OwnMatcherConfig)
     assert len(matcher(config.matcher).match(torch.zeros(3, 2, 2), torch.zeros(3, 2, 2))) == 1
+
+
+def test_a_table_takes_depth_from_files(own: Path) -> None:
+    content = "defaults: [files_schema, /matcher@matcher: flow, _self_]\nname: ready\nfolder: .\n"
+    (own / "depth" / "ready.yaml").write_text(content)
+    assert isinstance(depth_source(Catalogue.with_own([str(own)]).depth("ready")), FilesDepth)
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,8 @@ MAX_VIEWS = 12
 SEARCHES = ((128, 0.03, 0), (256, 0.006, 6), (256, 0.0012, 6))
 """Longer side in pixels, step between the logarithms of scales, and steps to either side of the
 scale that the search before has found; the first search is over all possible scales."""
+COMPARED = 4096
+"""About so many pixels of a view are compared with other views."""
 TELLING = 1.5
 """A scale that is wrong by this factor must fit worse, ..."""
 MIN_RISE = 0.02
@@ -129,6 +131,7 @@ def differences(views: Sequence[View]) -> list[float | None]:
 def _difference(view: View, others: Sequence[View]) -> float | None:
     assert view.depth is not None
     points = unproject_to_world(view.depth, view.camera)[view.depth > 0]
+    points = points[:: max(1, len(points) // COMPARED)]
     best = torch.full_like(points[:, 0], torch.inf)
     for other in others:
         assert other.depth is not None

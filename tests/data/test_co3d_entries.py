@@ -186,6 +186,16 @@ def test_black_targets_of_the_challenge_are_left_out_as_known(tmp_path, kind):
             frame.load()
 
 
+def test_targets_whose_picture_was_withheld_are_left_out_as_known(tmp_path):
+    write_capture(tmp_path, names=("one",), frames=9)
+    _as_challenge(tmp_path, "test_unseen")
+    for entry in frame_entries(tmp_path):
+        if entry["meta"]["frame_type"] == "test_unseen":
+            (tmp_path / entry["image"]["path"]).unlink()
+    (sequence,) = read_category(tmp_path, "cup")
+    assert (len(sequence.frames), sequence.left_out) == (6, ())
+
+
 def test_unseen_frames_with_a_picture_are_frames(tmp_path):
     """In the first release, and in the development sets of the second, they are photographs."""
     write_capture(tmp_path, names=("one",), frames=3, size=96)
