@@ -191,6 +191,7 @@ def test_a_category_is_prepared_from_the_videos_that_are_there(tmp_path, caplog)
         ("_image_size", struct.pack("ii", 2**30, 2**30)),
         ("frame_timestamp", -1.0),
         ("frame_timestamp", "soon"),
+        ("_depth_scale_adjustment", "far"),
     ],
 )
 def test_unusable_frames_are_left_out_with_a_reason(tmp_path, column, value):
@@ -199,6 +200,18 @@ def test_unusable_frames_are_left_out_with_a_reason(tmp_path, column, value):
     sequence = uco3d.read_sequence(tmp_path, "1-2-3")
     assert len(sequence.frames) == 3
     assert "frame 1" in sequence.left_out[0]
+
+
+def test_entries_of_other_types_are_no_error_of_the_program(tmp_path):
+    write(tmp_path)
+    change(tmp_path, "UPDATE frame_annots SET frame_number = 'two' WHERE frame_number = 2")
+    change(tmp_path, "UPDATE sequence_annots SET _reconstruction_quality_viewpoint = 'good'")
+    sequence = uco3d.read_sequence(tmp_path, "1-2-3")
+    assert len(sequence.frames) == 3
+    assert sequence.viewpoint_quality is None
+    change(tmp_path, "UPDATE sequence_annots SET _video_path = 7")
+    with pytest.raises(InputError, match="1-2-3"):
+        uco3d.read_sequence(tmp_path, "1-2-3")
 
 
 def test_bad_files_are_named(tmp_path):

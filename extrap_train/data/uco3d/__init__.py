@@ -89,7 +89,7 @@ def _sequences(root: Path, condition: str, value: str) -> Iterator[FrameSequence
     )
     missing = []
     for name, category, *paths, quality in rows:
-        files = [check_relative(path, root / METADATA) if path else None for path in paths]
+        files = [check_relative(str(path), root / METADATA) if path else None for path in paths]
         video, mask, depth = (path if path and (root / path).is_file() else None for path in files)
         if video is None:
             missing.append(name)
@@ -102,7 +102,7 @@ def _sequences(root: Path, condition: str, value: str) -> Iterator[FrameSequence
             name=str(name),
             frames=frames,
             left_out=left_out,
-            viewpoint_quality=quality,
+            viewpoint_quality=quality if isinstance(quality, float) else None,
         )
     if missing:
         log.warning(
@@ -127,6 +127,8 @@ def _frames(
                 raise ValueError(f"a size of {height} x {width}")
             if not (isinstance(seconds, float) and 0 <= seconds < math.inf):
                 raise ValueError(f"a time of {seconds}")
+            if not (isinstance(number, int) and isinstance(scale, float | None)):
+                raise ValueError(f"a number of {number!r}, a scale of depth of {scale!r}")
             values = [
                 _unpack(v, "<f4", s) for v, s in zip(viewpoint, _VIEWPOINT.values(), strict=True)
             ]
@@ -138,7 +140,7 @@ def _frames(
             reason = " ".join(str(error).split())
             left_out.append(f"{root / METADATA}: {where} cannot be used ({reason})")
         else:
-            one = VideoFrame(root, int(number), seconds, camera, lens, video, mask, depth, scale)
+            one = VideoFrame(root, number, seconds, camera, lens, video, mask, depth, scale)
             sound.append(one)
     return VideoFrames(tuple(sound)), tuple(left_out)
 
