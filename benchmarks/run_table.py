@@ -1,7 +1,6 @@
 """Run a table: what is missing is made and scored, what is there is used, reports are written."""
 
 import math
-import os
 import shutil
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
@@ -47,7 +46,7 @@ from benchmarks.run.run_method import check_output, run_method
 from benchmarks.score.scoring import missing_networks
 from extrap_train.config import FilesDepthConfig, MethodConfig, TableConfig
 from extrap_train.errors import InputError
-from extrap_train.jobs import Died, Launcher
+from extrap_train.jobs import Died, Launcher, available_cores
 from extrap_train.jobs.isolated import IsolatedJob, IsolatedLauncher
 from extrap_train.jobs.local import LocalLauncher
 from extrap_train.store.atomic import file_lock, remove_leftovers
@@ -214,7 +213,7 @@ def _isolated_launcher(
     """What runs the methods' code, each time in a process of its own."""
     ours = {config.factory.rpartition(".")[0] for config in configs if is_ours(config)}
     preload = ("benchmarks.run.run_method", *sorted(ours))
-    cores = 1 if device_of(table) == "cuda" else len(os.sched_getaffinity(0))
+    cores = 1 if device_of(table) == "cuda" else available_cores()
     return IsolatedLauncher(options.workers or cores, table.cell_timeout_s, preload)
 
 

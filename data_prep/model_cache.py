@@ -4,7 +4,6 @@ A network that is sent to another process takes a file descriptor for each tenso
 keeps them open: a few jobs with MASt3R's nine hundred tensors exceed a process's limit.
 """
 
-import os
 import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from extrap_train.data.paths import file_stamp
 from extrap_train.depth import DepthSource
 from extrap_train.depth.sources import depth_source, weight_files
 from extrap_train.device import fastest_device
+from extrap_train.jobs import available_cores
 from extrap_train.matching import Matcher
 from extrap_train.matching.matchers import matcher
 
@@ -64,7 +64,7 @@ class PrepModels:
         has_network = any(getattr(model, "has_network", False) for model in models)
         if has_network and fastest_device().type == "cuda":
             return 1
-        return len(os.sched_getaffinity(0))
+        return available_cores()
 
     def check(self) -> None:
         """Raises InputError where weights cannot be used, without taking a GPU's memory."""

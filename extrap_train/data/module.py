@@ -1,6 +1,5 @@
 """Batches for training and validation, a pure function of the seed and of the step they are for."""
 
-import os
 import signal
 from collections.abc import Callable, Iterator
 
@@ -11,7 +10,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 from extrap_train.config import TrainConfig
 from extrap_train.data.examples import Example, ExampleReader, linspace_indices, mirror
 from extrap_train.geometry.warp import compute_warp
-from extrap_train.jobs import start_fork_server
+from extrap_train.jobs import available_cores, start_fork_server
 from extrap_train.views import PackedBatch, PairBatch
 
 _PRELOAD = ("extrap_train.data.module",)
@@ -142,7 +141,7 @@ class PairModule(lightning.LightningDataModule):
         """Workers come from a server of their own: forked from this process, they would keep the
         memory that its weights had at that moment.
         """
-        workers = min(self.config.trainer.workers, len(os.sched_getaffinity(0)))
+        workers = min(self.config.trainer.workers, available_cores())
         device = self.trainer.strategy.root_device.type if self.trainer else "cpu"
         return DataLoader(
             dataset,

@@ -43,6 +43,13 @@ class Launcher(Protocol):
         ...
 
 
+def available_cores() -> int:
+    """How many cores this process may use; where the system does not say, all of the machine's."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def start_fork_server(preload: Collection[str]) -> ForkServerContext:
     """Start this process's server unless it runs; returns what starts processes from it.
 

@@ -16,9 +16,16 @@ import pytest
 
 from extrap_train.config import SlurmConfig
 from extrap_train.errors import InputError
-from extrap_train.jobs import ONE_THREAD, Died, Launcher
+from extrap_train.jobs import ONE_THREAD, Died, Launcher, available_cores
 from extrap_train.jobs.local import LocalLauncher
 from extrap_train.jobs.slurm import SubmittedLauncher, open_launcher, slurm_launcher
+
+
+def test_cores_are_counted_where_the_system_binds_no_process(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert available_cores() == os.cpu_count()
 
 
 def square(number: int) -> int:
