@@ -45,6 +45,8 @@ class Frame:
     reading: str = ""
     """What else decides about what `load` returns, in words: the lens that it undoes, the unit of
     depth files."""
+    path: str = ""
+    """Of the photograph, as `WholePhotograph.path`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +81,7 @@ class Photograph:
             load=self.load,
             files=(*files, *(self.root / file for file in depth if file)),
             reading=", ".join(parts),
+            path=self.image_path,
         )
 
     def load(self, *, depth: bool = True) -> View:

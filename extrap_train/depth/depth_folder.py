@@ -15,7 +15,7 @@ from torch import Tensor
 from extrap_train.data.image_files import MAX_PIXELS, image_size, read_picture
 from extrap_train.data.paths import require_file
 from extrap_train.errors import InputError
-from extrap_train.views import Camera, WholePhotograph
+from extrap_train.views import Camera
 
 SUFFIXES = (".npz", ".npy", ".png")
 LARGEST_ASPECT_CHANGE = 0.06
@@ -43,18 +43,19 @@ class StoredDepth:
     depth: Float[Tensor, "h w"]
     """As it is stored, but 0 where it is not finite."""
     confidence: Float[Tensor, "h w"]
-    """Not negative; 1 everywhere if the file has none."""
+    """0 to 1; 1 everywhere if the file has none."""
     intrinsics: Float[Tensor, "3 3"] | None = None
     """At the size of the map."""
     world_to_cam: Float[Tensor, "4 4"] | None = None
 
 
-def find_depth_file(folder: Path, photograph: WholePhotograph) -> Path | None:
-    """The photograph's depth file: its path with a suffix replaced or added; None if none is there.
+def find_depth_file(folder: Path, photograph: str) -> Path | None:
+    """The depth file of a photograph, named by its path below the capture's root: that path with a
+    suffix replaced or added; None if none is there.
 
     InputError if there is more than one.
     """
-    path = folder / PurePosixPath(photograph.path)
+    path = folder / PurePosixPath(photograph)
     names = [path.with_suffix(suffix) for suffix in SUFFIXES]
     names += [path.with_name(path.name + suffix) for suffix in SUFFIXES]
     found = [name for name in dict.fromkeys(names) if name.is_file()]
@@ -79,10 +80,13 @@ def read_depth_file(file: Path) -> StoredDepth:
             f"{file}: `depth` of shape {depth.shape} is zero everywhere or no map of height x "
             "width; restore or remove the file"
         )
+    if not 0 <= confidence.min() <= confidence.max() <= 1:
+        raise InputError(
+            f"{file}: `confidence` is {confidence.min():.3g} to {confidence.max():.3g}, and must "
+            "be 0 to 1; rescale it or leave it out"
+        )
     camera = {name: _matrix(arrays[name], name, file) for name in [*shapes][1:] if name in arrays}
-    return StoredDepth(
-        file, torch.from_numpy(depth), torch.from_numpy(confidence).clamp_min(0), **camera
-    )
+    return StoredDepth(file, torch.from_numpy(depth), torch.from_numpy(confidence), **camera)
 
 
 def require_same_camera(stored: StoredDepth, camera: Camera, extent: float) -> None:

@@ -83,7 +83,7 @@ class FilesDepth:
     def _find(self, view: View) -> Path | None:
         if view.photograph is None:
             return None
-        return find_depth_file(self.folder, view.photograph)
+        return find_depth_file(self.folder, view.photograph.path)
 
     def _require(self, view: View) -> Path:
         file = self._find(view)

@@ -9,10 +9,17 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from extrap_train.config import FilesDepthConfig, SyntheticConfig, TrainConfig, dotted
+from extrap_train.config import (
+    DepthConfig,
+    FilesDepthConfig,
+    SyntheticConfig,
+    TrainConfig,
+    dotted,
+)
 from extrap_train.data.scene_spec import SYNTHETIC_SCHEME, open_scene, scene_address
 from extrap_train.data.sequences import NO_CATEGORY, Frame, FrameSequence
 from extrap_train.data.square_frames import input_views, select_input_frames
+from extrap_train.depth.depth_folder import find_depth_file
 from extrap_train.depth.sources import depth_source, weight_files
 from extrap_train.errors import InputError
 from extrap_train.runs import given_name, short_name
@@ -134,7 +141,8 @@ def scene_manifest(
         "trainer.precision": config.trainer.precision,
         "seed": config.seed,
     }
-    depth_files = {_depth_label(f, config): f for f in weight_files(config.depth) if f.is_file()}
+    frames = list(frames)
+    depth_files = _depth_files(config.depth, frames)
     return Manifest.of(
         dotted(common) | dict(options),
         {
@@ -145,11 +153,15 @@ def scene_manifest(
     )
 
 
-def _depth_label(path: Path, config: TrainConfig) -> str:
-    """Depth maps of several folders may have the same name."""
-    if isinstance(config.depth, FilesDepthConfig) and path.is_relative_to(str(config.depth.folder)):
-        return path.relative_to(str(config.depth.folder)).as_posix()
-    return path.name
+def _depth_files(depth: DepthConfig, frames: Iterable[Frame]) -> dict[str, Path]:
+    """What the depth of these frames is made from: of a folder of depth maps, their own files."""
+    if not isinstance(depth, FilesDepthConfig):
+        return {file.name: file for file in weight_files(depth) if file.is_file()}
+    folder = Path(depth.folder or "")
+    maps = [find_depth_file(folder, frame.path) for frame in frames if frame.path]
+    found = {file.relative_to(folder).as_posix(): file for file in maps if file}
+    matching = weight_files(depth.matcher) if depth.align == "affine" else []
+    return found | {file.name: file for file in matching}
 
 
 def result_folder(config: TrainConfig, label: str) -> Path:

@@ -9,12 +9,15 @@ from PIL import Image
 from traced_scenes import SCENES, orbit_camera, render
 
 from extrap_train import open_views, warp_view
+from extrap_train.cli import TRAIN, compose_config
 from extrap_train.config import FilesDepthConfig, FlowMatcherConfig
+from extrap_train.data.scene_spec import open_scene
 from extrap_train.depth import DepthSource, NoDepthError
 from extrap_train.depth.sources import depth_source, weight_files
 from extrap_train.errors import InputError
 from extrap_train.geometry.cameras import WorldFrame
 from extrap_train.reconstruction.inputs import first_views
+from extrap_train.tasks.scene_inputs import scene_manifest
 from extrap_train.views import View, WholePhotograph
 
 SCENE = SCENES["box on the ground"]
@@ -153,6 +156,8 @@ def _wrong(view):
         "rotation": {"world_to_cam": turned},
         "of no matrix": {"intrinsics": torch.zeros(3, 3)},
         "of another shape": {"world_to_cam": torch.eye(3)},
+        "confidence beyond 1": {"confidence": torch.full((96, 96), 1.5)},
+        "negative confidence": {"confidence": torch.full((96, 96), -0.5)},
         "confidence of another size": {"confidence": torch.ones(3, 3)},
     }
 
@@ -226,6 +231,24 @@ def test_views_in_one_place_do_not_tell_the_scale(tmp_path, views):
     for given in (near, near[:1]):
         with pytest.raises(NoDepthError):
             source(tmp_path).depth_maps(given)
+
+
+def test_depth_of_another_scene_is_no_input_of_a_result(tmp_path):
+    """One folder may hold the depth of a whole data set."""
+    scene = "synthetic:hydrant/0003"
+    words = ["category=hydrant", f"scene={scene}", "depth=files", f"depth.folder={tmp_path}"]
+    config = compose_config(TRAIN, ["task=scene", *words])
+    frames = open_scene(scene).frames[:2]
+    for sequence in ("0003", "0004"):
+        (tmp_path / "hydrant" / sequence).mkdir(parents=True)
+
+    def inputs(sequence, value):
+        np.save(tmp_path / "hydrant" / sequence / "frame000000.npy", np.full((2, 2), value))
+        return scene_manifest(config, frames, {}, {}).inputs
+
+    first = inputs("0003", 1.0)
+    assert inputs("0004", 1.0) == first
+    assert inputs("0003", 2.0) != first
 
 
 @pytest.mark.parametrize("folder", [None, "", "/nowhere"])

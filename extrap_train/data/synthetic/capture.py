@@ -39,7 +39,8 @@ def synthetic_sequence(category: str, index: int, options: SyntheticConfig) -> F
     for number in range(options.frames):
         name, camera = f"frame{number:06d}", cameras[number]
         whole = WholePhotograph(f"{category}/{sequence_name(index)}/{name}", camera)
-        frames.append(Frame(name, camera, True, True, _Renderer(scene, whole, name).load, ()))
+        load = _Renderer(scene, whole, name).load
+        frames.append(Frame(name, camera, True, True, load, (), path=whole.path))
     return FrameSequence(category, sequence_name(index), tuple(frames))
 
 

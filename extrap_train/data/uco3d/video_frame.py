@@ -40,6 +40,11 @@ class VideoFrame:
         """As CO3D calls it."""
         return f"frame{self.number:06d}"
 
+    @property
+    def path(self) -> str:
+        """Beside the video, as if the frame were a file there."""
+        return f"{Path(self.video).parent.as_posix()}/{self.name}"
+
     def frame(self) -> Frame:
         """The frame as others see it."""
         files = (self.video, self.mask_video, self.depths)
@@ -51,6 +56,7 @@ class VideoFrame:
             load=self.load,
             files=tuple(self.root / file for file in files if file),
             reading=f"{self.seconds} s, {self.lens}, depth in {self.depth_scale}",
+            path=self.path,
         )
 
     def load(self, *, depth: bool = True) -> View:
@@ -59,14 +65,13 @@ class VideoFrame:
         mask = self._straighten(self.mask_video)[..., 0] if self.mask_video else None
         if mask is not None and not mask.any():
             raise InputError(f"{self.root / str(self.mask_video)}: {self.name}: its mask is empty")
-        path = f"{Path(self.video).parent.as_posix()}/{self.name}"
         return View(
             image=image.permute(2, 0, 1).contiguous(),
             camera=self.camera,
             depth=self._read_depth() if depth and self.depths else None,
             mask=mask,
             name=self.name,
-            photograph=WholePhotograph(path, self.camera),
+            photograph=WholePhotograph(self.path, self.camera),
         )
 
     def _straighten(self, video: str) -> Float[Tensor, "h w 3"]:
