@@ -9,8 +9,8 @@ from torch import Tensor
 from benchmarks.perf.timing import Timing, compare, devices
 from benchmarks.perf.warp_timing import orbit_camera
 from extrap_train.gaussians.density import rotation_matrices
+from extrap_train.gaussians.differentiable import LOW_PASS, NEAR_PLANE
 from extrap_train.gaussians.losses import photometric_loss, prepare_truth
-from extrap_train.gaussians.projection import LOW_PASS, NEAR_PLANE
 from extrap_train.gaussians.projection_numba import MIN_ALPHA
 from extrap_train.gaussians.rasterize import rasterizer
 from extrap_train.geometry.cameras import pixel_grid

@@ -13,9 +13,14 @@ from numba.core.event import Event, Listener, install_listener
 from torch import Tensor
 
 from extrap_train.errors import InputError
-from extrap_train.gaussians.blend import blend_ellipses
+from extrap_train.gaussians.differentiable import (
+    LOW_PASS,
+    NEAR_PLANE,
+    Ellipses,
+    blend_ellipses,
+    project,
+)
 from extrap_train.gaussians.gaussian_model import Gaussians, sh_colors
-from extrap_train.gaussians.projection import LOW_PASS, NEAR_PLANE, Ellipses, project
 from extrap_train.views import Camera
 
 _LOG = logging.getLogger(__name__)

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from extrap_train.data.synthetic.kernels import Real
 from extrap_train.data.synthetic.material import (
     Material,
     Mottled,
@@ -14,7 +15,6 @@ from extrap_train.data.synthetic.material import (
 )
 from extrap_train.data.synthetic.parts import Part, placement
 from extrap_train.data.synthetic.shapes import flat_ground, lathe, rounded_box
-from extrap_train.data.synthetic.vectors import Real
 
 WOODS = ["#a06a3d", "#b9834c", "#8a5c36", "#d0aa74", "#6e4a34"]
 FLOOR_WOODS = ["#b98a58", "#cfa56e", "#a67c55", "#d8bd92", "#94724f", "#b5a48c"]

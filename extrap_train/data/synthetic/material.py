@@ -6,8 +6,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from extrap_train.data.synthetic.noise import fractal_noise
-from extrap_train.data.synthetic.vectors import Real
+from extrap_train.data.synthetic.kernels import Real, fractal_noise
 
 Color = Float[np.ndarray, " 3"]
 Numbers = Float[np.ndarray, " n"]

@@ -10,9 +10,9 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Float, Int
 
+from extrap_train.data.synthetic.kernels import Real
 from extrap_train.data.synthetic.material import Material
 from extrap_train.data.synthetic.shapes import Mesh, Point, merge, move_mesh
-from extrap_train.data.synthetic.vectors import Real
 from extrap_train.geometry.compiled import compiled
 
 _DIRECTIONS = 40

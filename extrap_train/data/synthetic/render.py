@@ -8,10 +8,9 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
+from extrap_train.data.synthetic.kernels import dot, fractal_noise, normalize, rotate
 from extrap_train.data.synthetic.material import LocalPoints, linear_to_srgb
-from extrap_train.data.synthetic.noise import fractal_noise
 from extrap_train.data.synthetic.parts import Hits, Part, SyntheticScene
-from extrap_train.data.synthetic.vectors import dot, normalize, rotate
 from extrap_train.views import Camera, View
 
 _REACH = 1.5

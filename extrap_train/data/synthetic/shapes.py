@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from extrap_train.data.synthetic.vectors import Real, rotate
+from extrap_train.data.synthetic.kernels import Real, rotate
 
 _CREASE = np.cos(np.deg2rad(35.0))
 

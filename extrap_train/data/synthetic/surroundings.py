@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from extrap_train.data.synthetic import ground
 from extrap_train.data.synthetic.ground import draw_seed
+from extrap_train.data.synthetic.kernels import Real, fractal_noise
 from extrap_train.data.synthetic.material import (
     Color,
     LocalPoints,
@@ -19,7 +20,6 @@ from extrap_train.data.synthetic.material import (
     mix,
     vary_color,
 )
-from extrap_train.data.synthetic.noise import fractal_noise
 from extrap_train.data.synthetic.parts import Part, placement
 from extrap_train.data.synthetic.shapes import (
     Mesh,
@@ -30,7 +30,6 @@ from extrap_train.data.synthetic.shapes import (
     lathe,
     rounded_box,
 )
-from extrap_train.data.synthetic.vectors import Real
 
 _SKY_RADIUS = 19.0
 _PAINTS = ["#b5483c", "#3f6fa3", "#d8b24a", "#5c8a5a", "#cfc6b6", "#6d5a86", "#444b55", "#c98a4b"]

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from extrap_train.data.synthetic.ground import draw_seed
+from extrap_train.data.synthetic.kernels import fractal_noise
 from extrap_train.data.synthetic.material import (
     Color,
     LocalPoints,
@@ -15,7 +16,6 @@ from extrap_train.data.synthetic.material import (
     mix,
     vary_color,
 )
-from extrap_train.data.synthetic.noise import fractal_noise
 from extrap_train.data.synthetic.parts import Part, placement
 from extrap_train.data.synthetic.shapes import Mesh, displace, lathe, sheet, sweep
 

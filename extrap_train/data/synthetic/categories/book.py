@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from extrap_train.data.synthetic.ground import draw_seed
+from extrap_train.data.synthetic.kernels import Real, fractal_noise
 from extrap_train.data.synthetic.material import (
     Color,
     LocalPoints,
@@ -15,10 +16,8 @@ from extrap_train.data.synthetic.material import (
     step,
     vary_color,
 )
-from extrap_train.data.synthetic.noise import fractal_noise
 from extrap_train.data.synthetic.parts import Part, placement
 from extrap_train.data.synthetic.shapes import rounded_box
-from extrap_train.data.synthetic.vectors import Real
 
 PLACES = (0.15, 0.2, 0.65)
 """How likely one is found outdoors, on a floor, on a table."""

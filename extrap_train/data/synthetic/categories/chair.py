@@ -5,10 +5,10 @@ from collections.abc import Callable
 import numpy as np
 
 from extrap_train.data.synthetic.ground import CLOTHS, WOODS, draw_seed
+from extrap_train.data.synthetic.kernels import Real
 from extrap_train.data.synthetic.material import Material, Mottled, Plaid, Plain, Wood, vary_color
 from extrap_train.data.synthetic.parts import Part, placement
 from extrap_train.data.synthetic.shapes import Mesh, capsule, lathe, rounded_box, sheet, sweep, xyz
-from extrap_train.data.synthetic.vectors import Real
 
 PLACES = (0.3, 0.7, 0.0)
 """How likely one is found outdoors, on a floor, on a table."""

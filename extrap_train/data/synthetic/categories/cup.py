@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from extrap_train.data.synthetic.ground import draw_seed
+from extrap_train.data.synthetic.kernels import Real
 from extrap_train.data.synthetic.material import (
     Color,
     LocalPoints,
@@ -21,7 +22,6 @@ from extrap_train.data.synthetic.material import (
 )
 from extrap_train.data.synthetic.parts import Part, placement
 from extrap_train.data.synthetic.shapes import Mesh, lathe, sweep
-from extrap_train.data.synthetic.vectors import Real
 
 PLACES = (0.2, 0.0, 0.8)
 """How likely one is found outdoors, on a floor, on a table."""

@@ -3,6 +3,7 @@
 import numpy as np
 
 from extrap_train.data.synthetic.ground import draw_seed
+from extrap_train.data.synthetic.kernels import Real
 from extrap_train.data.synthetic.material import (
     Color,
     Material,
@@ -13,7 +14,6 @@ from extrap_train.data.synthetic.material import (
 )
 from extrap_train.data.synthetic.parts import Part, placement
 from extrap_train.data.synthetic.shapes import Mesh, lathe, merge, move_mesh, sweep
-from extrap_train.data.synthetic.vectors import Real
 
 PLACES = (1.0, 0.0, 0.0)
 """How likely one is found outdoors, on a floor, on a table."""

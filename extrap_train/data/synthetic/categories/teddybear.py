@@ -3,6 +3,7 @@
 import numpy as np
 
 from extrap_train.data.synthetic.ground import CLOTHS, draw_seed
+from extrap_train.data.synthetic.kernels import Real
 from extrap_train.data.synthetic.material import (
     Color,
     Material,
@@ -14,7 +15,6 @@ from extrap_train.data.synthetic.material import (
 )
 from extrap_train.data.synthetic.parts import Part, placement
 from extrap_train.data.synthetic.shapes import capsule, ellipsoid, merge, move_mesh, sweep, xyz
-from extrap_train.data.synthetic.vectors import Real
 
 PLACES = (0.25, 0.4, 0.35)
 """How likely one is found outdoors, on a floor, on a table."""
