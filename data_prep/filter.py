@@ -12,7 +12,13 @@ from extrap_train.config import PrepConfig
 from extrap_train.data.camera_check import CO3D_POSES, find_pose_fault, is_degenerate
 from extrap_train.data.sequences import FrameSequence
 from extrap_train.data.square_frames import too_many_unusable
-from extrap_train.geometry.viewpoints import LOOKS_AT_RAD, facing, fit_orbit, scene_center
+from extrap_train.geometry.viewpoints import (
+    LOOKS_AT_RAD,
+    camera_centers,
+    facing,
+    fit_orbit,
+    scene_center,
+)
 from extrap_train.views import Camera, stack_poses
 
 LOG = logging.getLogger(__name__)
@@ -80,9 +86,9 @@ def judge(sequence: FrameSequence, options: PrepConfig) -> Verdict:
 
 def azimuth_coverage(cameras: Camera) -> tuple[float, float]:
     """Largest gap within the covered arc, and the arc itself, in degrees around the orbit."""
-    orbit = fit_orbit(cameras)
-    low = np.abs(orbit.elevations_rad) < _MAX_ELEVATION_RAD
-    azimuths = np.degrees(np.sort(orbit.azimuths_rad[low]))
+    azimuths_rad, elevations_rad, _ = fit_orbit(cameras).locate(camera_centers(cameras))
+    low = np.abs(elevations_rad) < _MAX_ELEVATION_RAD
+    azimuths = np.degrees(np.sort(azimuths_rad[low]))
     gaps = np.sort(np.diff(azimuths, append=azimuths[:1] + 360))
     if len(gaps) < 2:
         return 0.0, 0.0

@@ -18,7 +18,7 @@ from extrap_train.data.examples import linspace_indices, pack, read_example
 from extrap_train.data.prepared import UNTOUCHED, Pairs, PreparedData
 from extrap_train.data.square_frames import held_out_mask
 from extrap_train.figures import colour_depth, draw_contact_sheet, error_map, mark_holes
-from extrap_train.geometry.viewpoints import fit_orbit
+from extrap_train.geometry.viewpoints import camera_centers, fit_orbit
 from extrap_train.geometry.warp import warp_references
 from extrap_train.store.atomic import write_atomic
 
@@ -118,7 +118,8 @@ def coverage(data: PreparedData) -> Figure:
     figure = Figure(figsize=(5, 5), layout="constrained")
     axes = figure.add_subplot(projection="polar")
     for ring, (name, role) in enumerate(zip(shown["sequence"], shown["split"], strict=True)):
-        azimuths = fit_orbit(data.cameras(name)).azimuths_rad
+        cameras = data.cameras(name)
+        azimuths, _, _ = fit_orbit(cameras).locate(camera_centers(cameras))
         tested = held_out_mask(len(azimuths)) if role == "train and test" else role == "test"
         tested = np.broadcast_to(tested, azimuths.shape)
         for split, own in (("train", ~tested), ("test", tested)):

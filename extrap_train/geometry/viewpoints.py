@@ -17,21 +17,10 @@ from extrap_train.views import Camera
 
 LOOKS_AT_RAD = np.deg2rad(60)
 """Largest angle between an optical axis and a point that the camera is said to look at."""
+MIN_VIEWS = 3
+"""Fewer do not show which way their orbit leans."""
 _SAME_PLACE = 1e-9
 """Distances below this share of the scene's extent are zero."""
-
-
-@dataclass(frozen=True)
-class Orbit:
-    """Cylinder coordinates of cameras around a scene."""
-
-    axis: Float[np.ndarray, "3"]
-    """Unit length; points where the cameras' image-up points on average."""
-    center: Float[np.ndarray, "3"]
-    azimuths_rad: Float[np.ndarray, " n"]
-    """In [0, 2π), from an arbitrary zero; means nothing near the axis."""
-    elevations_rad: Float[np.ndarray, " n"]
-    """Towards the axis, in [-π/2, π/2]."""
 
 
 def camera_centers(cameras: Camera) -> Float[np.ndarray, "n 3"]:
@@ -84,24 +73,6 @@ def pairwise_angles(cameras: Camera, center: Float[np.ndarray, "3"]) -> Float[np
     angles = np.arccos(np.clip(directions @ directions.T, -1.0, 1.0))
     np.fill_diagonal(angles, 0.0)
     return angles
-
-
-def fit_orbit(cameras: Camera) -> Orbit:
-    """Fit the axis that the cameras circle the scene's centre around.
-
-    The axis is the direction in which the viewing *directions* vary least: distances drop out, so
-    that an ellipse is as good as a circle, and their mean is taken off, so that a high orbit is
-    as good as a level one.
-    """
-    center = scene_center(cameras)
-    directions = directions_from(cameras, center)
-    first, _, axis = np.linalg.svd(directions - directions.mean(0))[2]
-    up = -cameras.world_to_cam[:, 1, :3].double().numpy(force=True).mean(0)
-    if axis @ up < 0:
-        axis = -axis
-    azimuths = np.arctan2(directions @ np.cross(axis, first), directions @ first)
-    elevations = np.arcsin(np.clip(directions @ axis, -1.0, 1.0))
-    return Orbit(axis, center, azimuths % (2 * np.pi), elevations)
 
 
 def references_by_nearness(references: Camera, queries: Camera) -> Int[np.ndarray, "q n"]:
@@ -160,26 +131,23 @@ def farthest_point_sample(
     return np.array(chosen)
 
 
-MIN_VIEWS = 3
-"""Fewer do not show which way their orbit leans."""
-
 Angles = Float[np.ndarray, "*n"] | float
 
 
 @dataclass(frozen=True)
-class Circle:
+class Orbit:
     """A way around a scene: azimuths about an axis, elevations towards it."""
 
     center: Float[np.ndarray, "3"]
     axis: Float[np.ndarray, "3"]
     """Unit length, upwards in the photographs."""
     east: Float[np.ndarray, "3"]
-    """Unit length; azimuth 0, where the first view stands."""
+    """Unit length; azimuth 0."""
 
     @classmethod
     def around(
         cls, center: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"], views: Camera
-    ) -> "Circle":
+    ) -> "Orbit":
         """Starts at the first of the views."""
         first = directions_from(views[:1], center)[0]
         east = first - (first @ axis) * axis
@@ -188,12 +156,16 @@ class Circle:
     def locate(
         self, positions: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Azimuths in [0, 2π), elevations in [−π/2, π/2], both in radians, and distances."""
+        """Azimuths in [0, 2π), elevations in [−π/2, π/2], both in radians, and distances.
+
+        An azimuth means nothing near the axis; both are 0 for a position on the centre.
+        """
         offsets = positions - self.center
         distances = np.linalg.norm(offsets, axis=1)
-        directions, north = offsets / distances[:, None], np.cross(self.axis, self.east)
+        away, north = np.where(distances > 0, distances, 1), np.cross(self.axis, self.east)
+        directions = offsets / away[:, None]
         azimuths = np.arctan2(directions @ north, directions @ self.east) % (2 * np.pi)
-        return azimuths, np.arcsin(np.clip(offsets @ self.axis / distances, -1, 1)), distances
+        return azimuths, np.arcsin(np.clip(offsets @ self.axis / away, -1, 1)), distances
 
     def poses(
         self, azimuths_rad: Float[np.ndarray, " n"], elevation_rad: Angles, distance: Angles
@@ -209,8 +181,24 @@ class Circle:
         return looking_at(self.center + far * out, self.center, self.axis)
 
 
-def fit_circle(cameras: Camera) -> Circle:
-    """The circle of two or more cameras that look at a scene from one side or from all.
+def fit_orbit(cameras: Camera) -> Orbit:
+    """Fit the axis that the cameras circle the scene's centre around.
+
+    The axis is the direction in which the viewing *directions* vary least: distances drop out, so
+    that an ellipse is as good as a circle, and their mean is taken off, so that a high orbit is
+    as good as a level one.
+    """
+    center = scene_center(cameras)
+    directions = directions_from(cameras, center)
+    first, _, axis = np.linalg.svd(directions - directions.mean(0))[2]
+    up = -cameras.world_to_cam[:, 1, :3].double().numpy(force=True).mean(0)
+    if axis @ up < 0:
+        axis = -axis
+    return Orbit(center, axis, first)
+
+
+def fit_orbit_of_few(cameras: Camera) -> Orbit:
+    """The orbit of two or more cameras that look at a scene from one side or from all.
 
     The axis is the direction that the cameras' horizontal axes have least in common with: a few
     photographs from one side do not show which way their positions bend, but all are held upright.
@@ -218,7 +206,7 @@ def fit_circle(cameras: Camera) -> Circle:
     right = cameras.world_to_cam[:, 0, :3].double().numpy(force=True)
     axis = np.linalg.eigh(right.T @ right)[1][:, 0]
     up = -cameras.world_to_cam[:, 1, :3].double().numpy(force=True).mean(0)
-    return Circle.around(scene_center(cameras), axis if axis @ up > 0 else -axis, cameras)
+    return Orbit.around(scene_center(cameras), axis if axis @ up > 0 else -axis, cameras)
 
 
 def orbit_cameras(views: Camera, span_rad: float, count: int) -> Camera:
@@ -231,10 +219,10 @@ def orbit_cameras(views: Camera, span_rad: float, count: int) -> Camera:
     if len(views.world_to_cam) < MIN_VIEWS:
         raise ValueError(f"an orbit needs {MIN_VIEWS} views, not {len(views.world_to_cam)}")
     orbit = fit_orbit(views)
-    circle = Circle.around(orbit.center, orbit.axis, views)
-    _, elevations_rad, distances = circle.locate(camera_centers(views))
+    orbit = Orbit.around(orbit.center, orbit.axis, views)
+    _, elevations_rad, distances = orbit.locate(camera_centers(views))
     azimuths_rad = span_rad / count * np.arange(count)
-    matrices = circle.poses(azimuths_rad, np.median(elevations_rad), np.median(distances))
+    matrices = orbit.poses(azimuths_rad, np.median(elevations_rad), np.median(distances))
     return Camera(
         torch.from_numpy(matrices).to(views.world_to_cam.dtype),
         _central_lens(views).expand(count, 3, 3).clone(),

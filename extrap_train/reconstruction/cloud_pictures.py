@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrap_train.figures import draw_contact_sheet, plot_cameras, save_figure, write_film
-from extrap_train.geometry.viewpoints import camera_centers, fit_circle, scene_center
+from extrap_train.geometry.viewpoints import camera_centers, fit_orbit_of_few, scene_center
 from extrap_train.geometry.warp import splat_points
 from extrap_train.reconstruction.cloud import PointCloud
 from extrap_train.reconstruction.global_map import GlobalMap
@@ -76,14 +76,14 @@ def framed(cameras: Camera, cloud: PointCloud) -> Camera:
 
 def draw_plan(scene_map: GlobalMap, queries: Sequence[Query], path: Path) -> None:
     """Inputs and queries seen from above, numbered in the order in which they are planned."""
-    circle = fit_circle(scene_map.cameras)
-    plane = np.stack([circle.east, np.cross(circle.axis, circle.east)], 1)
+    orbit = fit_orbit_of_few(scene_map.cameras)
+    plane = np.stack([orbit.east, np.cross(orbit.axis, orbit.east)], 1)
     figure, axes = plt.subplots(figsize=(5, 5), layout="constrained")
     planned = stack_cameras([query.camera for query in queries]) if queries else None
     for cameras, colour, label in ((scene_map.cameras, "C0", "given"), (planned, "C1", "planned")):
         if cameras is None:
             continue
-        offsets, forward = camera_centers(cameras) - circle.center, cameras.forward.double().numpy()
+        offsets, forward = camera_centers(cameras) - orbit.center, cameras.forward.double().numpy()
         plot_cameras(axes, offsets, forward, plane, colour, label)
     axes.legend()
     save_figure(figure, path)

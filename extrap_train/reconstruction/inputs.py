@@ -17,7 +17,7 @@ from extrap_train.geometry.viewpoints import (
     camera_centers,
     facing,
     farthest_point_sample,
-    fit_circle,
+    fit_orbit_of_few,
     pairwise_angles,
     scene_center,
 )
@@ -67,7 +67,7 @@ def choose_frames(
     if draw == "spread":
         chosen = farthest_point_sample(camera_centers(cameras), count, start)
         return sorted(int(index) for index in chosen)
-    azimuths, _, _ = fit_circle(cameras).locate(camera_centers(cameras))
+    azimuths, _, _ = fit_orbit_of_few(cameras).locate(camera_centers(cameras))
     walks: dict[float, list[int]] = {}
     for first in (start, *np.argsort(azimuths)):
         walk = [int(first)]

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from extrap_train.geometry.viewpoints import (
     camera_centers,
-    fit_circle,
+    fit_orbit_of_few,
     pairwise_angles,
     scene_center,
 )
@@ -39,8 +39,8 @@ def orbit_queries(cameras: Camera, step_rad: float) -> list[Query]:
 
     Elevation and distance go over from one end of a gap to the other.
     """
-    circle = fit_circle(cameras)
-    azimuths, elevations, distances = circle.locate(camera_centers(cameras))
+    orbit = fit_orbit_of_few(cameras)
+    azimuths, elevations, distances = orbit.locate(camera_centers(cameras))
     order = np.argsort(azimuths, kind="stable")
     queries = []
     around = azimuths[order]
@@ -52,7 +52,7 @@ def orbit_queries(cameras: Camera, step_rad: float) -> list[Query]:
         elevation, distance = (
             (1 - shares) * x[one] + shares * x[other] for x in (elevations, distances)
         )
-        made = _cameras_at(circle.poses(gap_azimuths, elevation, distance), cameras)
+        made = _cameras_at(orbit.poses(gap_azimuths, elevation, distance), cameras)
         queries += [
             Query(f"orbit{round(np.degrees(azimuth)) % 360:03d}", made[i])
             for i, azimuth in enumerate(gap_azimuths)
@@ -64,11 +64,11 @@ def circle_cameras(cameras: Camera, first: Float[np.ndarray, "3"], count: int) -
     """`count` cameras evenly around the scene, the first one towards the point `first`, at the
     mean height and distance of some.
     """
-    circle = fit_circle(cameras)
-    (start,), _, _ = circle.locate(first[None])
-    _, elevations, distances = circle.locate(camera_centers(cameras))
+    orbit = fit_orbit_of_few(cameras)
+    (start,), _, _ = orbit.locate(first[None])
+    _, elevations, distances = orbit.locate(camera_centers(cameras))
     azimuths = start + 2 * np.pi * np.arange(count) / count
-    return _cameras_at(circle.poses(azimuths, elevations.mean(), distances.mean()), cameras)
+    return _cameras_at(orbit.poses(azimuths, elevations.mean(), distances.mean()), cameras)
 
 
 def _cameras_at(world_to_cam: Float[np.ndarray, "n 4 4"], like: Camera) -> Camera:

@@ -5,7 +5,7 @@ import pytest
 import torch
 from orbits import even, ring
 
-from extrap_train.geometry.viewpoints import camera_centers, facing, fit_circle, orbit_cameras
+from extrap_train.geometry.viewpoints import camera_centers, facing, fit_orbit_of_few, orbit_cameras
 from extrap_train.views import Camera
 
 
@@ -35,7 +35,7 @@ def test_two_views_are_no_orbit():
 
 
 def test_cameras_on_a_circle_are_found_where_they_were_put():
-    circle = fit_circle(ring(even(7), elevation_deg=20))
+    circle = fit_orbit_of_few(ring(even(7), elevation_deg=20))
     azimuths, elevations = np.radians([10, 100, 350]), np.radians([-5, 0, 40])
     distances = np.array([1.0, 2.0, 3.0])
     poses = torch.from_numpy(circle.poses(azimuths, elevations, distances))
@@ -51,7 +51,7 @@ def test_cameras_on_a_circle_are_found_where_they_were_put():
 
 def test_a_circle_starts_at_its_first_view_and_leans_as_its_views_do():
     views = ring(even(5), elevation_deg=20)
-    circle = fit_circle(views)
+    circle = fit_orbit_of_few(views)
     azimuths, elevations, distances = circle.locate(camera_centers(views))
     assert np.abs(np.angle(np.exp(1j * azimuths[0]))) < 1e-6
     np.testing.assert_allclose(circle.axis, [0, 0, 1], atol=1e-5)
