@@ -78,7 +78,7 @@ def model_options(config: TrainConfig) -> dict[str, Any]:
     """The options that say how published weights are read; a saved model says so itself."""
     if is_own(_folder_of(named_weights(config))):
         return {}
-    return dotted({"model": asdict(config.model)})
+    return _flat(config.model)
 
 
 def trained_model(config: TrainConfig) -> ExtrapolationModel:

@@ -11,9 +11,7 @@ from pathlib import Path
 import torch
 from rich.console import Console
 
-from extrap_train.config import (
-    TrainConfig,
-)
+from extrap_train.config import TrainConfig
 from extrap_train.data.sequences import FrameSequence
 from extrap_train.data.square_frames import object_square
 from extrap_train.data.transforms_json import read_cameras
