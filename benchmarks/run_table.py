@@ -30,7 +30,7 @@ from benchmarks.run.cells import (
     keep_output,
     score_cell,
 )
-from benchmarks.run.method_content import MISSING_WEIGHTS, is_ours, method_contents
+from benchmarks.run.identity import MISSING_WEIGHTS, is_ours, method_contents
 from benchmarks.run.plan import (
     OpenJobs,
     TableFolder,

@@ -13,13 +13,13 @@ from benchmarks.protocol.prepared_scene import Scene, truths_of
 from benchmarks.protocol.scene_writing import prepare_scene
 from benchmarks.run.cells import OK, Cell, CellJob, read_cell
 from benchmarks.run.identity import (
+    MethodContent,
     cell_key,
     identity_of,
     images_manifest,
     preparing_code,
     scores_manifest,
 )
-from benchmarks.run.method_content import MethodContent
 from extrap_train.config import DepthConfig, MethodConfig, TableConfig
 from extrap_train.data.frame_files import sequence_folder
 from extrap_train.depth.sources import weight_files

@@ -15,7 +15,7 @@ from benchmarks.catalogue import Catalogue
 from benchmarks.protocol.prepared_scene import Scene
 from benchmarks.report.aggregate import TIDY, read_results
 from benchmarks.run import run_method
-from benchmarks.run.method_content import MethodContent
+from benchmarks.run.identity import MethodContent
 from benchmarks.run.plan import cell_jobs, open_protocol
 from benchmarks.run.run_method import check_output
 from extrap_train.errors import InputError
