@@ -56,7 +56,7 @@ def test_only_an_oracle_is_given_the_data_sets_depth(tmp_path: Path) -> None:
     """A source of one's own that reads the views' depth finds none."""
     capture = Capture(analytic_capture(size=32))
     draw = draw_sequence("apple", "one", *_frames(capture.sequence), _RULES)[0]
-    config = OwnDepthConfig(name="peek", factory="extrap_train.depth.dataset.DatasetDepth")
+    config = OwnDepthConfig(name="peek", factory="extrap_train.depth.DatasetDepth")
     with pytest.raises(InputError, match="depth"):
         prepare_scene(tmp_path / "scenes" / "draw", capture, draw, _RULES, config, "origin")
 
