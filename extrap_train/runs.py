@@ -56,6 +56,7 @@ _NOT_PART_OF_THE_RUN = (
     "trainer.checkpoint_every",
     "trainer.validate_every",
     "complete",
+    "studio",
     "model.sampler",
     *(field.name for field in fields(SceneOptions)),
 )

@@ -65,9 +65,11 @@ class Bar:
     def _print_line(self) -> None:
         self._told_at, self._told = time.monotonic(), self.done
         if self in _OPEN and not _LIVE:
-            terminal(stderr=True).print(f"{self.label}: {self._state()}")
+            terminal(stderr=True).print(f"{self.label}: {self.state}")
 
-    def _state(self) -> str:
+    @property
+    def state(self) -> str:
+        """How much of it is done, and how long the rest will take."""
         elapsed = time.monotonic() - self._started
         parts = [f"{self.done}/{self.total} {self.unit}"]
         if self.done >= self.total:
@@ -79,7 +81,7 @@ class Bar:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """The label, the bar and how it stands; a second line where one would be cut."""
-        state = self._state()
+        state = self.state
         room = options.max_width - len(self.label) - len(state) - 2
         bar = ProgressBar(self.total, self.done, width=max(4, min(_BAR_COLUMNS, room)))
         line = Table.grid(padding=(0, 1))
@@ -128,6 +130,11 @@ def progress(
         if opens_display:
             _LIVE.pop().stop()
         _OPEN.remove(bar)
+
+
+def open_bars() -> tuple[Bar, ...]:
+    """The bars of what is being done at the moment, outermost first."""
+    return tuple(_OPEN)
 
 
 def track(

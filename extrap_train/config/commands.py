@@ -11,7 +11,7 @@ from extrap_train.config.data_sources import (
 )
 from extrap_train.config.model_options import ModelConfig, SamplerOptions
 from extrap_train.config.options import MISSING, option
-from extrap_train.config.scene_options import CompletionConfig, SceneOptions
+from extrap_train.config.scene_options import CompletionConfig, SceneOptions, StudioConfig
 
 
 @dataclass
@@ -170,6 +170,7 @@ TASKS = {
     "pack": "write a trained model as a packaged one",
     "push": "upload a trained model to the Hugging Face hub (repo=org/name)",
     "scene": "adapt a model to one scene (LoRA)",
+    "studio": "serve a page to drop photographs on, look at views, complete and download",
     "validate": "measure a trained model on held-out sequences",
     "view": "make one view of a scene (pose=) or a walk around it (orbit=)",
 }
@@ -195,6 +196,7 @@ class TrainConfig(SceneOptions):
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
     validation: ValidationConfig = field(default_factory=ValidationConfig)
     complete: CompletionConfig = field(default_factory=CompletionConfig)
+    studio: StudioConfig = field(default_factory=StudioConfig)
     task: str = option("category", "what to do; see Tasks", choices=tuple(TASKS))
     seed: int = option(0, "seed of everything random", low=0, high=2**30)
     run: str | None = option(

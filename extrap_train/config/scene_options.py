@@ -173,3 +173,14 @@ class CompletionConfig:
         "address that the viewer listens on: this machine only; 0.0.0.0 lets others see it too",
     )
     port: int = option(8080, "port of the viewer, or the next free one", low=1, high=65535)
+
+
+@dataclass
+class StudioConfig:
+    """Where the page of task=studio is."""
+
+    host: str = option(
+        "127.0.0.1",
+        "address that the page listens on: this machine only; 0.0.0.0 lets others use it too",
+    )
+    port: int = option(8090, "port of the page, or the next free one", low=1, high=65535)

@@ -41,7 +41,7 @@ from extrap_train.store.digests import cache_folder, file_digest, folder_digest
 from extrap_train.terminal import progress
 
 MAX_PICTURES = 1000
-_SUFFIXES = (*PICTURE_SUFFIXES, ".heic", ".heif")
+PHOTOGRAPH_SUFFIXES = (*PICTURE_SUFFIXES, ".heic", ".heif")
 _MAX_NAMED = 8
 _SEAL = "sparse.sha256"
 _REMEDY = (
@@ -56,7 +56,7 @@ def find_pictures(folder: Path) -> list[str]:
     """The names of the photographs in a folder, which need not exist, in order; not of masks."""
     if not folder.is_dir():
         return []
-    paths = (path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES)
+    paths = (path for path in folder.iterdir() if path.suffix.lower() in PHOTOGRAPH_SUFFIXES)
     files = (path for path in paths if path.is_file() or path.is_symlink())  # broken ones are named
     names = sorted(path.name for path in files if not path.name.startswith("."))
     return [name for name in names if not is_mask_name(name, names)]

@@ -2,8 +2,8 @@
 
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -83,6 +83,9 @@ _NOT_PART_OF_THE_MAP = (
 )
 """May differ on resume: what is made of the map once it is whole, and where weights lie."""
 
+Watch = Callable[[GlobalMap], None]
+"""Called with the map before the first new view, after each, and once all are there."""
+
 
 @dataclass(frozen=True)
 class _Job:
@@ -117,15 +120,18 @@ class _Job:
         return None if path is None else Path(path)
 
 
-def run(config: TrainConfig) -> Outcome:
-    """Complete a scene; a second run resumes after the last whole view, or says that it is done."""
+def run(config: TrainConfig, watch: Watch | None = None) -> Outcome:
+    """Complete a scene; a second run resumes after the last whole view, or says that it is done.
+
+    `watch` takes the place of the viewer. What it raises ends the run, which keeps its views.
+    """
     job = _open_job(config)
     console = terminal()
     manifest = scene_manifest(config, job.photographs, job.weights, _map_options(config))
     with claim(job.folder, manifest, resume=config.resume) as result:
         if not result.is_reused:
             result.begin()
-        return Outcome(job.folder, _run(job, console))
+        return Outcome(job.folder, _run(job, console, watch))
 
 
 def _open_job(config: TrainConfig) -> _Job:
@@ -180,7 +186,7 @@ def _check_category(config: TrainConfig, sequence: FrameSequence) -> None:
     terminal().print(f"the scene is of category {own}, not {chosen}")
 
 
-def _run(job: _Job, console: Console) -> bool:
+def _run(job: _Job, console: Console, watch: Watch | None) -> bool:
     """Whether every view was there already."""
     pipeline = _pipeline(job)
     known = _start_map(job, pipeline, console)
@@ -195,9 +201,10 @@ def _run(job: _Job, console: Console) -> bool:
         return False
     missing = _count_missing(known, queries)
     require_space(job.folder, missing * view_bytes(pipeline.generator.warp_size))
-    with _viewer(job, known, console) as viewer:
+    with _viewer(job, console) if watch is None else nullcontext(watch) as show:
+        show(known)
         with advise_on_sampling_memory(1, job.config.trainer):
-            known = _complete_map(job, known, queries, pipeline, viewer)
+            known = _complete_map(job, known, queries, pipeline, show)
         steps = load_steps(job.folder / "map", len(known))
         seconds = {
             "inputs": load_input_seconds(job.folder / "map"),
@@ -289,16 +296,15 @@ def _plan_text(known: GlobalMap, order: list[Query]) -> str:
 
 
 @contextmanager
-def _viewer(job: _Job, known: GlobalMap, console: Console) -> Iterator[CloudViewer | None]:
+def _viewer(job: _Job, console: Console) -> Iterator[Watch]:
     """The page, where it is wanted; once all is done it stays until its visitor ends it."""
     options = job.config.complete
     if not options.viewer:
-        yield None
+        yield lambda known: None
         return
     with CloudViewer(options.port, options.confidence.votes, options.host) as viewer:
-        viewer.show(known)
         console.print(f"viewer: {viewer.url}")
-        yield viewer
+        yield viewer.show
         if sys.stdin.isatty():
             input("the scene is complete and written; Enter closes the viewer ")
 
@@ -308,7 +314,7 @@ def _complete_map(
     known: GlobalMap,
     queries: list[Query],
     pipeline: CompletionPipeline,
-    viewer: CloudViewer | None,
+    show: Watch,
 ) -> GlobalMap:
     folder = job.folder / "map"
     left = _count_missing(known, queries)
@@ -316,11 +322,9 @@ def _complete_map(
 
         def on_step(grown: GlobalMap, added: MapView, step: Step) -> None:
             save_view(added, step, folder, len(grown) - 1)
-            if viewer is not None:
-                viewer.show(grown)
             bar.advance()
+            show(grown)
 
         known = fuse_depths(complete(known, queries, pipeline, on_step))
-    if viewer is not None:
-        viewer.show(known)
+    show(known)
     return known

@@ -1,6 +1,5 @@
 """The growing cloud in a real browser: it connects, draws, and its sliders choose what is shown."""
 
-import shutil
 import threading
 from collections.abc import Iterator
 from typing import Any
@@ -9,6 +8,7 @@ import numpy as np
 import pytest
 import scenes
 import torch
+from headless import headless_page
 from PIL import Image
 
 from extrap_train.reconstruction.global_map import (
@@ -21,7 +21,6 @@ from extrap_train.reconstruction.global_map import (
 from extrap_train.reconstruction.viewer import CloudViewer
 from extrap_train.views import View
 
-_BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 _SIZE = 48
 _SCENE = scenes.Scene((scenes.sphere(0.6), scenes.plane(0.6, (0.0, 1.0, 0.0))))
 
@@ -46,18 +45,8 @@ def viewer() -> Iterator[CloudViewer]:
 
 @pytest.fixture
 def window(viewer: CloudViewer) -> Iterator[Any]:
-    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
-    browser = next(filter(None, map(shutil.which, _BROWSERS)), None)
-    if browser is None:
-        pytest.skip("needs chromium")
-    software = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    with playwright.sync_playwright() as driver:
-        opened = driver.chromium.launch(executable_path=browser, args=software)
-        page = opened.new_page(viewport={"width": 640, "height": 420})
-        page.errors = []
-        page.on("pageerror", lambda error: page.errors.append(str(error)))
+    with headless_page(640, 420) as page:
         yield page
-        opened.close()
 
 
 def test_more_views_are_more_points_and_the_sliders_take_them_away(viewer: CloudViewer) -> None:
