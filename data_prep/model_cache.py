@@ -76,7 +76,7 @@ class PrepModels:
 
 
 def _identity(model: object) -> str:
-    return f"{model!r} {[file_stamp(file) for file in weight_files(model)]}"
+    return f"{model!r} {[(str(file), file_stamp(file)) for file in weight_files(model)]}"
 
 
 def release_models() -> None:

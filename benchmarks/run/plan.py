@@ -136,7 +136,7 @@ def prepare_draws(
     by_name = {(c.sequence.category, c.sequence.name): c for c in captures}
     files = [path for path in weight_files(depth) if path.is_file()]
     made_by = [preparing_code(), asdict(table.captures), asdict(table.rules)]
-    made_by += [asdict(depth), *map(file_digest, files)]
+    made_by += [asdict(depth), {str(file): file_digest(file) for file in files}]
     for draw in draws:
         origin = digest([*made_by, asdict(draw)])
         capture = by_name[draw.category, draw.sequence]

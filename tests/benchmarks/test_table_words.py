@@ -90,6 +90,7 @@ def test_every_table_of_the_package_is_sound() -> None:
         assert table.methods[:2] == ["nearest", "inpainted"]
         assert table.columns[:2] == ["unseen_psnr", "unseen_ssim"]
         assert table.rules.is_oracle == name.endswith("_oracle")
+        assert not (table.reported and "halves" in table.draws)
         for method, options in table.options.items():
             build_method(catalogue.method(method, options))
         catalogue.check(table)

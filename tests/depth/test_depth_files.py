@@ -1,6 +1,7 @@
 import math
 import zipfile
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,9 +9,12 @@ import torch
 from PIL import Image
 from traced_scenes import SCENES, orbit_camera, render
 
+from benchmarks.protocol.draws import Draw
+from benchmarks.run import plan
+from data_prep.model_cache import PrepModels
 from extrap_train import open_views, warp_view
 from extrap_train.cli import TRAIN, compose_config
-from extrap_train.config import FilesDepthConfig, FlowMatcherConfig
+from extrap_train.config import FilesDepthConfig, FlowMatcherConfig, TableConfig
 from extrap_train.data.scene_spec import open_scene
 from extrap_train.depth import DepthSource, NoDepthError
 from extrap_train.depth.sources import depth_source, weight_files
@@ -249,6 +253,25 @@ def test_depth_of_another_scene_is_no_input_of_a_result(tmp_path):
     first = inputs("0003", 1.0)
     assert inputs("0004", 1.0) == first
     assert inputs("0003", 2.0) != first
+
+
+def test_a_renamed_file_is_depth_of_another_photograph(tmp_path, monkeypatch):
+    """What a table or a preparation made before is made anew."""
+    monkeypatch.setattr(plan, "prepare_scene", lambda *parts: parts[-1])
+    np.save(tmp_path / "1.npy", np.ones((2, 2)))
+    draw = Draw("apple", "one", 3, "random", 0, ("a",), ("b",))
+    capture = SimpleNamespace(sequence=SimpleNamespace(category="apple", name="one"))
+    depth = FilesDepthConfig(folder=str(tmp_path), matcher=FlowMatcherConfig())
+
+    def identities():
+        table, folder = TableConfig(name="t"), plan.TableFolder(tmp_path.with_name("table"))
+        (origin,) = plan.prepare_draws(table, folder, [draw], [capture], depth)
+        return origin, PrepModels(depth, None).depth_identity
+
+    before = identities()
+    assert identities() == before
+    (tmp_path / "1.npy").rename(tmp_path / "2.npy")
+    assert not set(identities()) & set(before)
 
 
 @pytest.mark.parametrize("folder", [None, "", "/nowhere"])
