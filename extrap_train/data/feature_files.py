@@ -31,7 +31,7 @@ LATENTS, EMBEDDINGS, _TABLE = "latents.npy", "embeddings.npy", "features.parquet
 _REMEDY = "delete the folder and run data_prep with model= and model.start= again"
 _VERSION = 1
 _OPEN_SEQUENCES = 64
-"""Sequences whose files stay open: two descriptors each, beside those of the frames."""
+"""Sequences whose files stay mapped."""
 
 
 @dataclass(frozen=True)

@@ -136,7 +136,10 @@ def damaged_error(place: Path, what: str) -> InputError:
 
 
 def map_array(file: Path) -> np.ndarray:
-    """An array on disk, of which no more is asked for than the file holds."""
+    """An array on disk, of which no more is asked for than the file holds.
+
+    It keeps no descriptor, of which a process has a thousand: numpy's map would keep one.
+    """
     try:
         mapped: np.ndarray = np.load(file, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError, TypeError, OverflowError) as error:
@@ -144,7 +147,10 @@ def map_array(file: Path) -> np.ndarray:
         raise damaged_error(file.parent, f"{file.name}: {reason}") from None
     if not isinstance(mapped, np.memmap):  # a zip archive
         raise damaged_error(file.parent, f"{file.name} is not an array")
-    return mapped
+    size = mapped.offset + mapped.nbytes
+    content = torch.from_file(str(file), size=size, dtype=torch.uint8).numpy()
+    content.flags.writeable = False
+    return np.ndarray(mapped.shape, mapped.dtype, content, mapped.offset, mapped.strides)
 
 
 def sequence_folder(root: Path, kind: str, sequence: str) -> Path:

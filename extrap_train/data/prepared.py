@@ -54,7 +54,7 @@ such words, which would take a quarter of a gigabyte.
 """
 TABLES = ("sequences", "frames", "pairs")
 _OPEN_SEQUENCES = 128
-"""Sequences whose files stay open: two descriptors each, and a process has about a thousand."""
+"""Sequences whose files stay mapped."""
 
 
 @dataclass(frozen=True)

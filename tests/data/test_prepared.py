@@ -18,6 +18,7 @@ from extrap_train.data.frame_files import (
     SequenceFrames,
     StoredFrames,
     frames_folder,
+    map_array,
     write_frames,
 )
 from extrap_train.data.prepared import PreparedData
@@ -25,6 +26,18 @@ from extrap_train.depth import DatasetDepth
 from extrap_train.errors import InputError
 
 SIZE = 16
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_a_mapped_array_keeps_no_descriptor(tmp_path: Path, order: str) -> None:
+    """A training on several categories maps thousands, and a process may open about 1024 files."""
+    array = np.asarray(np.arange(6.0).reshape(2, 3), order=order)
+    np.save(tmp_path / "x.npy", array)
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    mapped = map_array(tmp_path / "x.npy")
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
+    np.testing.assert_array_equal(mapped, array)
+    assert not mapped.flags.writeable
 
 
 @pytest.fixture(scope="module")
