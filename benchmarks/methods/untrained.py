@@ -60,4 +60,5 @@ class InpaintedWarp:
             batch = compute_warp(batch, size)
             assert batch.warp is not None
             images = inpainted_warp(batch.warp).clamp(0, 1)
-        return Synthesis(images, watch.seconds / len(images), photographs_used(views))
+        given = {"depth": "used"} | photographs_used(views)
+        return Synthesis(images, watch.seconds / len(images), given)
