@@ -189,35 +189,35 @@ def _check_category(config: TrainConfig, sequence: FrameSequence) -> None:
 def _run(job: _Job, console: Console, watch: Watch | None) -> bool:
     """Whether every view was there already."""
     pipeline = _pipeline(job)
-    known = _start_map(job, pipeline, console)
-    queries = _queries(job, known)
+    scene_map = _start_map(job, pipeline, console)
+    queries = _queries(job, scene_map)
     # The same plan for a run that resumes.
-    start = replace(known, views=known.views[: len(job.inputs)])
+    start = replace(scene_map, views=scene_map.views[: len(job.inputs)])
     order = expected_order(start, queries)
     draw_plan(start, order, job.folder / "plan.png")
-    console.print(_plan_text(known, order))
+    console.print(_plan_text(scene_map, order))
     if job.config.complete.dry_run:
         console.print(f"plan: {job.folder / 'plan.png'}; nothing was generated")
         return False
-    missing = _count_missing(known, queries)
+    missing = _count_missing(scene_map, queries)
     require_space(job.folder, missing * view_bytes(pipeline.generator.warp_size))
     with _viewer(job, console) if watch is None else nullcontext(watch) as show:
-        show(known)
+        show(scene_map)
         with advise_on_sampling_memory(1, job.config.trainer):
-            known = _complete_map(job, known, queries, pipeline, show)
-        steps = load_steps(job.folder / "map", len(known))
+            scene_map = _complete_map(job, scene_map, queries, pipeline, show)
+        steps = load_steps(job.folder / "map", len(scene_map))
         seconds = {
             "inputs": load_input_seconds(job.folder / "map"),
             "views": sum(sum(step.seconds.values()) for step in steps),
         }
-        done = Completed(known, steps, job.world, job.truth, seconds)
+        done = Completed(scene_map, steps, job.world, job.truth, seconds)
         write_completed(done, job.config, job.sequence, pipeline, job.used, job.folder, console)
     return not missing
 
 
-def _count_missing(known: GlobalMap, queries: Sequence[Query]) -> int:
+def _count_missing(scene_map: GlobalMap, queries: Sequence[Query]) -> int:
     """How many of the queries the map does not have yet."""
-    there = {view.view.name for view in known.views}
+    there = {view.view.name for view in scene_map.views}
     return sum(query.name not in there for query in queries)
 
 
@@ -243,10 +243,10 @@ def _pipeline(job: _Job) -> CompletionPipeline:
 def _start_map(job: _Job, pipeline: CompletionPipeline, console: Console) -> GlobalMap:
     """What an earlier run left, or the inputs, measured and saved."""
     folder = job.folder / "map"
-    known = load_map(folder, job.config.complete.tolerance)
-    if len(known) >= len(job.inputs):
-        console.print(f"{folder}: {len(known)} views were made before and are used again")
-        return known
+    scene_map = load_map(folder, job.config.complete.tolerance)
+    if len(scene_map) >= len(job.inputs):
+        console.print(f"{folder}: {len(scene_map)} views were made before and are used again")
+        return scene_map
     started = time.perf_counter()
     size = pipeline.generator.warp_size
     require_space(job.folder, len(job.inputs) * view_bytes(size))
@@ -255,11 +255,11 @@ def _start_map(job: _Job, pipeline: CompletionPipeline, console: Console) -> Glo
     photographs = [frame.load(depth=brought) for frame in job.photographs]
     check_poses(photographs)
     views, confidences = first_views(photographs, source, job.world, size)
-    known = map_of_inputs(views, confidences, job.config.complete.tolerance)
+    scene_map = map_of_inputs(views, confidences, job.config.complete.tolerance)
     save_input_seconds(time.perf_counter() - started, folder)
-    for index, view in enumerate(known.views):
+    for index, view in enumerate(scene_map.views):
         save_view(view, None, folder, index)
-    return known
+    return scene_map
 
 
 def _map_options(config: TrainConfig) -> dict[str, Any]:
@@ -276,21 +276,21 @@ def _is_generated(config: TrainConfig) -> bool:
     return config.complete.generator != "exact"
 
 
-def _queries(job: _Job, known: GlobalMap) -> list[Query]:
-    given = stack_cameras([view.camera for view in known.views[: len(job.inputs)]])
+def _queries(job: _Job, scene_map: GlobalMap) -> list[Query]:
+    given = stack_cameras([view.camera for view in scene_map.views[: len(job.inputs)]])
     if job.config.complete.poses == "orbit":
         return orbit_queries(given, np.radians(job.config.complete.step_deg))
-    size = known.views[0].camera.width
+    size = scene_map.views[0].camera.width
     others = [frame for i, frame in enumerate(job.sequence.frames) if i not in job.inputs]
     queries = [Query(frame.name, job.world.inside(frame.camera.squared(size))) for frame in others]
     return [q for q in queries if not stand_where(q.camera, given, np.zeros(3)).any()]
 
 
-def _plan_text(known: GlobalMap, order: list[Query]) -> str:
-    there = {view.view.name for view in known.views}
+def _plan_text(scene_map: GlobalMap, order: list[Query]) -> str:
+    there = {view.view.name for view in scene_map.views}
     names = ", ".join(query.name for query in order if query.name not in there)
     return (
-        f"inputs: {', '.join(v.view.name for v in known.views if v.origin.kind == 'given')}\n"
+        f"inputs: {', '.join(v.view.name for v in scene_map.views if v.origin.kind == 'given')}\n"
         + (f"views to make, in about this order (coverage decides): {names or 'none is left'}")
     )
 
@@ -300,7 +300,7 @@ def _viewer(job: _Job, console: Console) -> Iterator[Watch]:
     """The page, where it is wanted; once all is done it stays until its visitor ends it."""
     options = job.config.complete
     if not options.viewer:
-        yield lambda known: None
+        yield lambda scene_map: None
         return
     with CloudViewer(options.port, options.confidence.votes, options.host) as viewer:
         console.print(f"viewer: {viewer.url}")
@@ -311,13 +311,13 @@ def _viewer(job: _Job, console: Console) -> Iterator[Watch]:
 
 def _complete_map(
     job: _Job,
-    known: GlobalMap,
+    scene_map: GlobalMap,
     queries: list[Query],
     pipeline: CompletionPipeline,
     show: Watch,
 ) -> GlobalMap:
     folder = job.folder / "map"
-    left = _count_missing(known, queries)
+    left = _count_missing(scene_map, queries)
     with progress("completing", left, "views") as bar:
 
         def on_step(grown: GlobalMap, added: MapView, step: Step) -> None:
@@ -325,6 +325,6 @@ def _complete_map(
             bar.advance()
             show(grown)
 
-        known = fuse_depths(complete(known, queries, pipeline, on_step))
-    show(known)
-    return known
+        scene_map = fuse_depths(complete(scene_map, queries, pipeline, on_step))
+    show(scene_map)
+    return scene_map

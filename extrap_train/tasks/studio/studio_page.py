@@ -237,10 +237,10 @@ class Studio:
         count = sum(summary["views"].values())
         return f"complete: {count} views, {summary['points']:,} points\nresult: {folder}"
 
-    def _watch(self, known: GlobalMap) -> None:
-        self._viewer.show(known)
+    def _watch(self, scene_map: GlobalMap) -> None:
+        self._viewer.show(scene_map)
         if self._stop.is_set():
-            raise _Stopped(f"stopped after {len(known)} views; complete again to continue")
+            raise _Stopped(f"stopped after {len(scene_map)} views; complete again to continue")
 
     def _send_to(self, client: Any) -> Callable[[], str]:
         """A job that sends the chosen file of the result to a visitor."""
