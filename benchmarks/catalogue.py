@@ -117,12 +117,13 @@ class Catalogue:
                 "rules.depth=dataset, which marks the table as an oracle"
             )
         check_options(composed, "depth.")
-        if getattr(composed, "checkpoint", "none needed") is None:
-            raise InputError(
-                f"rules.depth={name}: its weights are not given; write depth/NAME.yaml with "
-                "`checkpoint: FILE` into a folder of your own, and give rules.depth=NAME and "
-                "--config-dir (docs/benchmark.md)"
-            )
+        for needed in ("checkpoint", "folder"):
+            if getattr(composed, needed, "not needed") is None:
+                raise InputError(
+                    f"rules.depth={name}: its {needed} is not given; write depth/NAME.yaml with "
+                    f"`{needed}: PATH` into a folder of your own, and give rules.depth=NAME and "
+                    "--config-dir (docs/benchmark.md)"
+                )
         return composed
 
     def table(self, name: str, overrides: Sequence[str] = ()) -> TableConfig:

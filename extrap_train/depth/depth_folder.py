@@ -60,7 +60,9 @@ def find_depth_file(folder: Path, photograph: str) -> Path | None:
     names += [path.with_name(path.name + suffix) for suffix in SUFFIXES]
     found = [name for name in dict.fromkeys(names) if name.is_file()]
     if len(found) > 1:
-        raise InputError(f"{found[0]}: {found[1].name} is beside it; keep one of the two")
+        raise InputError(
+            f"{found[0]}: {found[1].name} beside it is called like depth, too; move one of them"
+        )
     return found[0] if found else None
 
 

@@ -42,6 +42,7 @@ def test_read_only_output_is_one_line(own: Path, tmp_path: Path) -> None:
         (["run", "table1", "draws=[sprd]"], "spread"),
         (["run", "table1", "rules.draws=[all]"], "rules.draws"),
         (["run", "table1", "rules.depth=stereoo"], "rules.depth"),
+        (["run", "table1", "rules.depth=files"], "folder: PATH"),
         (["run", "table1", "rules.views=[3,9]"], "rules.pool"),
         (["run", "table1", "scoring.lpips=[alx]"], "scoring.lpips"),
         (["run", "table1", "scoring.lpips_weights.alx=FILE"], "scoring.lpips_weights"),
