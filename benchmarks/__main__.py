@@ -107,6 +107,11 @@ def _parser() -> argparse.ArgumentParser:
     compare.add_argument("after", help="folder of a table's results")
     perf = command("perf", _perf, "time our kernels against plain implementations")
     perf.add_argument("name", nargs="?", choices=PERF_NAMES, help="default: all")
+    perf.add_argument(
+        "--end-to-end",
+        action="store_true",
+        help="with train: a whole step, from the stored frames to the averaged weights",
+    )
     perf.add_argument("--output", default="perf", help="folder of the CSV files (default: perf)")
     return parser
 
@@ -220,7 +225,12 @@ def _compare(options: argparse.Namespace) -> int:
 
 
 def _perf(options: argparse.Namespace) -> int:
-    for name in [options.name] if options.name else PERF_NAMES:
+    names = [options.name] if options.name else list(PERF_NAMES)
+    if options.end_to_end:
+        if options.name != "train":
+            raise InputError("--end-to-end is of `benchmark perf train`; name that or leave it out")
+        names = ["end_to_end"]
+    for name in names:
         module = importlib.import_module(f"benchmarks.perf.{name}_timing")
         timing = importlib.import_module("benchmarks.perf.timing")
         rows = module.run()

@@ -13,7 +13,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.perf.timing import Timing, compare
 from benchmarks.perf.warp_timing import ANGLES_DEG, QUERY_ANGLE_DEG, orbit_camera
-from extrap_train.config import ClipConfig, ModelConfig, UNetConfig, VaeConfig
+from extrap_train.config import NEAREST_ALONE, ClipConfig, ModelConfig, UNetConfig, VaeConfig
 from extrap_train.diffusion.encoders import Frozen
 from extrap_train.diffusion.model import ExtrapolationModel, use_channels_last
 from extrap_train.geometry.warp import compute_warp
@@ -60,10 +60,12 @@ def compare_models(
     return rows
 
 
-def configuration(width: int) -> ModelConfig:
-    """The family `ours` as `model=ours` has it, with `width` channels at its finest level."""
+def configuration(width: int, family: str = "ours") -> ModelConfig:
+    """A family as `model=` has it, with `width` channels at its finest level."""
     return ModelConfig(
         name="perf",
+        family=family,
+        references=1 if family in NEAREST_ALONE else 3,
         image_size=IMAGE_SIZE,
         vae=VaeConfig(channels=[32 * max(1, round(width / 80)) * x for x in (1, 2, 4, 4)]),
         clip=ClipConfig(width=64 * (width // 20), heads=width // 20),

@@ -2,6 +2,7 @@
 last, against the same network in plain float32.
 """
 
+from collections.abc import Callable
 from functools import partial
 
 import torch
@@ -22,7 +23,11 @@ _REPEATS = {"cpu": 3, "cuda": 15}
 
 def run() -> list[Timing]:
     """One row per device and batch size, on a GPU also with torch.compile."""
-    ours, plain = (partial(training_step, optimised=is_ours) for is_ours in (True, False))
+
+    def step(model: ExtrapolationModel, batch: PairBatch, *, is_ours: bool) -> Run:
+        return training_step(model, lambda: batch, optimised=is_ours)
+
+    ours, plain = (partial(step, is_ours=is_ours) for is_ours in (True, False))
     return [
         row
         for device in devices()
@@ -32,15 +37,17 @@ def run() -> list[Timing]:
     ]
 
 
-def training_step(model: ExtrapolationModel, batch: PairBatch, *, optimised: bool) -> Run:
-    """One step on the batch, with an optimiser of its own; it returns the loss."""
-    device = batch.image.device
+def training_step(
+    model: ExtrapolationModel, next_batch: Callable[[], PairBatch], *, optimised: bool
+) -> Run:
+    """One step on the next batch, with an optimiser of its own; it returns the loss."""
+    device = next(model.parameters()).device
     optimizer = torch.optim.AdamW(
         model.parameters(), lr=1e-5, fused=optimised, foreach=False if not optimised else None
     )
 
     def step() -> Float[Tensor, ""]:
-        draws = StepNoise(torch.Generator().manual_seed(0))
+        batch, draws = next_batch(), StepNoise(torch.Generator().manual_seed(0))
         with torch.autocast(device.type, torch.bfloat16, enabled=optimised):
             loss = diffusion_loss(model, batch, draws, 0.0)
         loss.backward()

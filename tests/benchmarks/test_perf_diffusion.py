@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -18,6 +19,7 @@ from benchmarks.perf.diffusion_case import (
     optimised,
     plain,
 )
+from benchmarks.perf.end_to_end_timing import compare_steps, prepared_captures
 from benchmarks.perf.sample_timing import plain_sampling, sampling
 from benchmarks.perf.train_timing import training_step
 from extrap_train.config import ModelConfig
@@ -62,8 +64,8 @@ def test_the_timed_model_is_arranged_and_the_plain_one_is_not(model: Extrapolati
 
 def test_both_steps_have_one_loss(model: ExtrapolationModel, batch: PairBatch) -> None:
     """Each as it is timed: fused, in mixed precision and channels last, against plain float32."""
-    theirs = training_step(plain(model), batch, optimised=False)()
-    ours = training_step(copy.deepcopy(model), batch, optimised=True)()
+    theirs = training_step(plain(model), lambda: batch, optimised=False)()
+    ours = training_step(copy.deepcopy(model), lambda: batch, optimised=True)()
     torch.testing.assert_close(ours, theirs, atol=0.02, rtol=0.02)
 
 
@@ -71,6 +73,15 @@ def test_both_samplers_generate_one_picture(model: ExtrapolationModel, batch: Pa
     theirs = plain_sampling(plain(model), batch)()
     ours = sampling(model, batch)()
     assert float((ours - theirs).abs().mean()) < 0.02
+
+
+@pytest.mark.slow
+def test_both_steps_from_stored_frames_to_the_average_have_one_loss(tmp_path: Path) -> None:
+    """From the same examples; on cached features and the compiled warp, and on plain ones."""
+    configs = [configuration(32, family) for family in ("ours", "zeronvs")]
+    data = prepared_captures(tmp_path, configs[0].warp_size)
+    for config in configs:
+        assert compare_steps(config, data, _CPU, repeats=1).max_abs_diff < 0.02
 
 
 def test_both_averages_are_one() -> None:

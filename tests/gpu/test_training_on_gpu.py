@@ -97,8 +97,8 @@ def test_throughput_at_full_size(gpu: torch.device, capsys: pytest.CaptureFixtur
     step = compare(
         f"training step, full size, batch {_BATCH}",
         gpu,
-        training_step(model, batch, optimised=True),
-        training_step(references, batch, optimised=False),
+        training_step(model, lambda: batch, optimised=True),
+        training_step(references, lambda: batch, optimised=False),
         repeats=10,
     )
     del model, references

@@ -43,32 +43,55 @@ def warp_references(
     are drawn: colours, coordinates, depth and mask move together, and nothing is resampled twice.
     """
     depths = torch.where(valid[..., None, None], depths, 0)
-    if needs_torch(images, depths):
-        # Unproject, cull what faces away or lies behind unseen space, project: points as
-        # dense as the query sees them.
-        samples = sample_surfaces(images, depths, cameras, query)
-        points = samples.points
-        if flows is not None:
-            points = move_points(points, samples.reference, flows, query)
-        # Eq. 1: one splat by depth of colours, coordinates and depth of all references.
-        means = splat_torch(points, samples.values, (len(images), query.height, query.width))
-    else:
-        drawn = sample_surfaces_numba(images, depths, cameras, query)
-        if flows is not None:
-            move_points_numba(drawn[0], drawn[3], flows, query)
-        means = splat_numba(*drawn, query.height, query.width)
+    draw = draw_torch if needs_torch(images, depths) else _draw_numba
+    return warp_of_means(draw(images, depths, cameras, query, flows))
+
+
+def warp_of_means(means: Float[Tensor, "b 8 h w"]) -> Warp:
+    """The warp that `draw_torch` has drawn."""
     # Channels: colour 0–2, coordinates 3–4, share of the nearest reference 5, depth 6, weight 7.
     share, weight = means[:, 5], means[:, 7]
-    nearest_mask = (share >= NEAREST_SHARE).to(images.dtype)
+    nearest_mask = (share >= NEAREST_SHARE).to(means.dtype)
     coordinates = means[:, 3:5] / torch.where(nearest_mask > 0, share, 1)[:, None]
     return Warp(
         image=means[:, :3],
         coordinates=coordinates * nearest_mask[:, None],
         depth=means[:, 6],
         weight=weight,
-        mask=(weight > 0).to(images.dtype),
+        mask=(weight > 0).to(means.dtype),
         nearest_mask=nearest_mask,
     )
+
+
+def draw_torch(
+    images: Float[Tensor, "b k 3 h w"],
+    depths: Float[Tensor, "b k h w"],
+    cameras: Camera,
+    query: Camera,
+    flows: Float[Tensor, "b k 2 g g"] | None,
+) -> Float[Tensor, "b 8 h2 w2"]:
+    """The channels of `warp_of_means`, in torch."""
+    # Unproject, cull what faces away or lies behind unseen space, project: points as dense as
+    # the query sees them.
+    samples = sample_surfaces(images, depths, cameras, query)
+    points = samples.points
+    if flows is not None:
+        points = move_points(points, samples.reference, flows, query)
+    # Eq. 1: one splat by depth of colours, coordinates and depth of all references.
+    return splat_torch(points, samples.values, (len(images), query.height, query.width))
+
+
+def _draw_numba(
+    images: Float[Tensor, "b k 3 h w"],
+    depths: Float[Tensor, "b k h w"],
+    cameras: Camera,
+    query: Camera,
+    flows: Float[Tensor, "b k 2 g g"] | None,
+) -> Float[Tensor, "b 8 h2 w2"]:
+    drawn = sample_surfaces_numba(images, depths, cameras, query)
+    if flows is not None:
+        move_points_numba(drawn[0], drawn[3], flows, query)
+    return splat_numba(*drawn, query.height, query.width)
 
 
 def compute_warp(batch: PairBatch, image_size: int | None = None) -> PairBatch:
