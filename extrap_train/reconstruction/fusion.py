@@ -48,6 +48,8 @@ def _fuse(view: MapView, scene_map: GlobalMap) -> tuple[Float[Tensor, "h w"], Fl
         distance, weight = signed_distance(points, scene_map.views[index], _TRUNCATION)
         total += weight * distance
         weights += weight
+    # 0 where no view weighs, so that free space that ends there ends in a surface: without that, as
+    # many true surfaces at grazing edges would be lost as false ones.
     mean = (total / weights.clamp(min=1e-30)).view_as(depths)
     shift = _nearest_zero(mean, shifts)
     found = shift.isfinite()

@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import shlex
 import urllib.error
 import urllib.request
 import zipfile
@@ -11,10 +12,12 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
+from hydra.core.hydra_config import HydraConfig
 from PIL import Image
 
 pytest.importorskip("viser", reason="needs viser: the extra `studio`")
@@ -29,7 +32,7 @@ from extrap_train.errors import InputError
 from extrap_train.tasks import complete
 from extrap_train.tasks.studio import uploads
 from extrap_train.tasks.studio.studio_page import Studio
-from extrap_train.tasks.studio.studio_scene import camera_of, of_photographs, zipped
+from extrap_train.tasks.studio.studio_scene import StudioScene, camera_of, of_photographs, zipped
 from extrap_train.tasks.studio.uploads import Upload
 
 
@@ -263,3 +266,18 @@ def test_dropped_photographs_get_their_depth_from_stereo(config: TrainConfig) ->
     dropped = of_photographs(replace(config, input_frames=["a"]), Path("somewhere"))
     assert dropped.depth.name == "stereo"
     assert (dropped.scene, dropped.input_frames) == ("somewhere", [])
+
+
+def test_the_shown_command_has_the_pages_choices_and_the_users_other_options(
+    config: TrainConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = ["task=studio", "category=cup", "inputs=9", "weights=my model", "studio.port=1"]
+    hydra = SimpleNamespace(overrides=SimpleNamespace(task=given))
+    monkeypatch.setattr(HydraConfig, "initialized", staticmethod(lambda: True))
+    monkeypatch.setattr(HydraConfig, "get", staticmethod(lambda: hydra))
+    options = replace(config, scene="a folder", inputs=4)
+    scene = StudioScene(options, cast(Any, None), [], cast(Any, None))
+    words = shlex.split(scene.command())
+    assert words[:3] == ["python", "-m", "extrap_train"]
+    assert {"task=complete", "scene=a folder", "inputs=4", "weights=my model"} < set(words)
+    assert not {"task=studio", "inputs=9", "studio.port=1"} & set(words)

@@ -2,6 +2,7 @@
 
 import io
 import math
+import shlex
 import zipfile
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Protocol
 import numpy as np
 import roma
 import torch
+from hydra.core.hydra_config import HydraConfig
 from jaxtyping import Float
 
 from extrap_train.config import DatasetDepthConfig, StereoConfig, TrainConfig
@@ -79,8 +81,17 @@ class StudioScene:
         """The command that completes the scene in the same way."""
         config = self.config
         words = ["task=complete", f"category={config.category.name}", f"scene={config.scene}"]
-        words += [f"depth={config.depth.name}", f"inputs={config.inputs}"]
-        return f"python -m extrap_train {' '.join(words)}"
+        words.append(f"depth={config.depth.name}")
+        if config.inputs is not None:
+            words.append(f"inputs={config.inputs}")
+        return f"python -m extrap_train {shlex.join([*words, *_other_words()])}"
+
+
+def _other_words() -> list[str]:
+    """What the studio's own command line says beside what the page chooses."""
+    given = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
+    chosen = ("task=", "category=", "scene=", "depth=", "inputs=", "studio.")
+    return [word for word in given if not word.startswith(chosen)]
 
 
 def open_studio_scene(config: TrainConfig, size: int) -> StudioScene:
