@@ -10,6 +10,7 @@ from extrap_train.config import (
     TrainConfig,
 )
 from extrap_train.config import DatasetDepthConfig as Depth
+from extrap_train.diffusion.footprint import Footprint
 from extrap_train.runs import (
     RunFolder,
     require_same_options,
@@ -40,7 +41,7 @@ def opened(config: TrainConfig, key: str = "key") -> RunFolder:
     require_same_options(folder, config)
     inputs = {"data of hydrant": key}
     manifest = Manifest.of(run_identity(config), inputs, {"hydrant": _SPLIT})
-    with _open_run(folder, config, manifest, terminal(quiet=True)):
+    with _open_run(folder, config, manifest, Footprint(0, 0), terminal(quiet=True)):
         return folder
 
 
