@@ -60,6 +60,9 @@ def ends_in_one_line() -> Iterator[None]:
         except InputError as error:
             raise _end(1, f"error: {error}") from None
         except KeyboardInterrupt as stopped:
+            # After an interrupt within code from a string, as dataclasses are made of, `python -m`
+            # would end by the signal; the next such code that ends takes that back.
+            exec("")
             said = str(stopped) or _RESUME
             if isinstance(stopped, Terminated) or isinstance(stopped.__context__, Terminated):
                 raise _end(143, f"terminated: {said}") from None

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
@@ -43,6 +44,21 @@ def test_an_end_has_a_status_and_one_line(
     assert said.startswith(line)
     assert said.count("\n") == 1
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL, "as it was before"
+
+
+def test_an_interrupted_module_ends_with_its_status_in_code_of_a_string_too(tmp_path: Path) -> None:
+    (tmp_path / "stopped.py").write_text(
+        "import os, signal\n"
+        "from extrap_train.errors import ends_in_one_line\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "with ends_in_one_line():\n"
+        "    exec('os.kill(os.getpid(), signal.SIGINT)')\n"
+    )
+    place = os.pathsep.join([str(tmp_path), str(Path(__file__).parents[1])])
+    command = [sys.executable, "-m", "stopped"]
+    done = subprocess.run(command, env=os.environ | {"PYTHONPATH": place}, capture_output=True)
+    assert done.returncode == 130
+    assert done.stderr.startswith(b"interrupted: ")
 
 
 def test_a_bug_keeps_its_traceback() -> None:
