@@ -170,7 +170,7 @@ def draw_curve(folder: RunFolder) -> None:
 
 def _table(validation: dict[str, dict[str, float]]) -> Table:
     metrics = [name for name, mean in validation["model"].items() if math.isfinite(mean)]
-    table = Table(title="held-out views")
+    table = Table(title="held-out views", padding=(0, 1, 0, 0))
     table.add_column(no_wrap=True)
     for metric in metrics:
         table.add_column(metric.replace("_", " "))
