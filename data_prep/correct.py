@@ -26,7 +26,7 @@ CORRECTION_VERSION = 3
 """Raised whenever the same frames give other corrections, so that old ones are made anew."""
 MIN_MATCHES = 40
 """Fewer do not tell a smooth motion from chance."""
-LARGEST_ACROSS = 0.006
+MAX_ACROSS = 0.006
 """Median distance of the matches from their points' epipolar lines, as a share of the picture's
 longer side (0.75 px of 128). Correct depths give 0, real poses and matchers about half of this
 limit, chance at least twice of it (docs/preparation.md)."""
@@ -79,7 +79,7 @@ def correct_pair(reference: View, query: View, matcher: Matcher, grid: int) -> C
     matches = matches[chosen]
     steps = matches.first_to_second
     across = float(steps_across(matches.first, steps, reference.camera, camera).median())
-    if across > LARGEST_ACROSS * max(camera.width, camera.height):
+    if across > MAX_ACROSS * max(camera.width, camera.height):
         return leave(f"the matches lie {across:.1f} px off their epipolar lines")
     size = torch.tensor([camera.width, camera.height])
     positions, steps = matches.first / size * 2 - 1, steps / size * 2

@@ -56,7 +56,7 @@ def ends_in_one_line() -> Iterator[None]:
     with _sigterm_raises():
         try:
             yield
-            sys.stdout.flush()  # a failure is told here, not while the interpreter ends
+            sys.stdout.flush()  # report a failure here, not while the interpreter exits
         except InputError as error:
             raise _end(1, f"error: {error}") from None
         except KeyboardInterrupt as stopped:

@@ -10,7 +10,7 @@ import pytest
 
 _FOLDER = Path(__file__).parents[1] / "notebooks"
 _NOTEBOOKS = sorted(_FOLDER.glob("*.ipynb"))
-_MOST_BYTES = 300_000
+_MAX_BYTES = 300_000
 
 
 @pytest.mark.parametrize("notebook", _NOTEBOOKS, ids=lambda path: path.stem)
@@ -19,7 +19,7 @@ def test_a_notebook_is_kept_with_its_outputs(notebook: Path) -> None:
     kinds = {output["output_type"] for cell in cells for output in cell["outputs"]}
     assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
     assert kinds == {"stream", "display_data"}
-    assert notebook.stat().st_size < _MOST_BYTES
+    assert notebook.stat().st_size < _MAX_BYTES
 
 
 @pytest.mark.slow

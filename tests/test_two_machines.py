@@ -89,8 +89,8 @@ def two_machines(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_two_machines_train_what_one_does_with_their_batches_as_one(
     two_machines: Path, tmp_path: Path
 ) -> None:
-    """Sums of halves round otherwise; AdamW lets that grow in weights whose gradient is zero, which
-    the loss and the views do not show."""
+    """The sum of two halves is rounded differently. AdamW amplifies this in weights whose gradient
+    is zero, so the loss and the generated views are compared instead of the weights."""
     command = [sys.executable, "-m", "extrap_train", *_OPTIONS, f"output={tmp_path}"]
     alone = [*command, "trainer.batch_size=4"]
     subprocess.run(alone, env=_environment(), check=True, timeout=400, stdout=subprocess.DEVNULL)

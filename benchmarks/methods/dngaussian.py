@@ -25,7 +25,7 @@ _LOCAL_WEIGHT, _GLOBAL_WEIGHT = 0.1, 1.0
 """Weights of the losses on depth normalised by the patch, and by the image."""
 _DEPTH_TOLERANCE = 0.01
 """Smaller differences of depth cost nothing."""
-_SMALLEST_PATCH, _LARGEST_PATCH = 5, 17
+_MIN_PATCH, _MAX_PATCH = 5, 17
 """Sides in pixels; each term draws its own."""
 _COARSEST_CELLS, _FINEST_CELLS, _BOUND = 16, 512, 3.0
 """The hash grid's cells along its coarsest level, its cells per extent along the finest, and half
@@ -122,9 +122,7 @@ class DnGaussianRecipe(Recipe):
             return depth.sum() * 0
         loss = depth.new_zeros(())
         for local, weight in ((True, _LOCAL_WEIGHT), (False, _GLOBAL_WEIGHT)):
-            drawn = torch.randint(
-                _SMALLEST_PATCH, _LARGEST_PATCH + 1, (1,), generator=training.generator
-            )
+            drawn = torch.randint(_MIN_PATCH, _MAX_PATCH + 1, (1,), generator=training.generator)
             term = patch_depth_loss(depth, prior, int(drawn), local, _DEPTH_TOLERANCE)
             loss = loss + weight * term
         return loss

@@ -33,10 +33,10 @@ from extrap_train.views import View
 
 @dataclass(frozen=True)
 class AffineSurrogate:
-    """Another source's depth under an affine map that is unknown and differs a photograph.
+    """Another source's depth under an unknown affine map, a different one for each photograph.
 
-    That is all that a monocular network can know at best, so a method that is given this is given
-    no more than a perfect network's answer: numbers made with it are marked as a surrogate's.
+    A perfect monocular network would say no more. Results that use this are marked as a
+    surrogate's.
     """
 
     source: DepthSource

@@ -43,32 +43,32 @@ class SyntheticConfig(DataConfig):
 
 
 @dataclass
-class Co3dConfig(DataConfig):
-    """A CO3D v1 or v2 download."""
+class DownloadConfig(DataConfig):
+    """A data set of captures that is downloaded."""
 
-    name: str = "co3d"
     test_sequences: int = option(
         5,
         "test sequences, drawn by a hash of their names; a lone sequence holds out frames instead",
         low=1,
         high=10_000,
     )
+
+
+@dataclass
+class Co3dConfig(DownloadConfig):
+    """A CO3D v1 or v2 download."""
+
+    name: str = "co3d"
     set_list: str | None = option(
         None, "one of CO3D's own splits instead, as fewview_dev: its train and test sequences only"
     )
 
 
 @dataclass
-class Uco3dConfig(DataConfig):
+class Uco3dConfig(DownloadConfig):
     """A uCO3D download."""
 
     name: str = "uco3d"
-    test_sequences: int = option(
-        5,
-        "test sequences, drawn by a hash of their names; a lone sequence holds out frames instead",
-        low=1,
-        high=10_000,
-    )
 
 
 @dataclass

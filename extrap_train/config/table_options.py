@@ -115,7 +115,7 @@ class RulesConfig:
 
     @property
     def is_oracle(self) -> bool:
-        """Whether methods are told more of a capture than its inputs show."""
+        """Whether methods learn more about a capture than its inputs show."""
         return self.depth == "dataset"
 
 

@@ -54,7 +54,7 @@ CENTRE_SIDES = 1e3
 SHORTEST_FOCAL, LONGEST_FOCAL = 0.2, 20.0
 """Range of a photograph's focal length: the shortest in its shorter side, which a circular fisheye
 fills, the longest in its longer one."""
-LARGEST_OFFSET = 0.25
+MAX_OFFSET = 0.25
 """Largest offset of a principal point from the photograph's middle, as a share of each side."""
 NORMALISED_FOCAL = 5.0
 """Focal length in pixels below which it must be given in widths of the picture."""
@@ -78,7 +78,7 @@ def fits_photograph(camera: Camera) -> Bool[Tensor, "*b"]:
     size = camera.intrinsics.new_tensor([camera.width, camera.height])
     focal = camera.intrinsics.diagonal(dim1=-2, dim2=-1)[..., :2]
     fits = (focal >= SHORTEST_FOCAL * size.min()) & (focal <= LONGEST_FOCAL * size.max())
-    centred = (camera.intrinsics[..., :2, 2] / size - 0.5).abs() <= LARGEST_OFFSET
+    centred = (camera.intrinsics[..., :2, 2] / size - 0.5).abs() <= MAX_OFFSET
     return ~is_degenerate(camera) & (fits & centred).all(-1)
 
 

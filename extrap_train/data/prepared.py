@@ -45,7 +45,7 @@ from extrap_train.store.records import read_record
 from extrap_train.views import Camera, ViewPair
 
 FORMAT = 6
-_LARGEST_SIZE = options_of(PrepConfig)["image_size"].declared.high
+_MAX_SIZE = options_of(PrepConfig)["image_size"].declared.high
 UNTOUCHED = -1
 """Flow number of a pair without a flow: its warp stays as it is."""
 _REPEATED = ("sequence", "split", "uncorrected")
@@ -275,7 +275,7 @@ def read_preparation(folder: Path) -> dict[str, Any]:
         raise InputError(f"{folder}: holds no finished preparation; run data_prep again")
     manifest = read_record(file, _Manifest, REMEDY)
     size = manifest.options.get("image_size")
-    if manifest.format != FORMAT or type(size) is not int or not 1 <= size <= _LARGEST_SIZE:
+    if manifest.format != FORMAT or type(size) is not int or not 1 <= size <= _MAX_SIZE:
         raise damaged_error(folder, f"{file} is not a manifest of format {FORMAT}")
     return asdict(manifest)
 

@@ -18,15 +18,15 @@ from extrap_train.errors import InputError
 from extrap_train.views import Camera
 
 SUFFIXES = (".npz", ".npy", ".png")
-LARGEST_ASPECT_CHANGE = 0.06
+MAX_ASPECT_CHANGE = 0.06
 """Networks round both sides to multiples of their patch."""
-LARGEST_FOCAL_CHANGE = 0.02
-LARGEST_SHIFT = 0.02
+MAX_FOCAL_CHANGE = 0.02
+MAX_SHIFT = 0.02
 """Of the principal point, as a share of the side."""
-LARGEST_TURN_DEG = 1.0
-LARGEST_STEP = 0.01
+MAX_TURN_DEG = 1.0
+MAX_STEP = 0.01
 """Between the two positions of a camera, as a share of the cameras' extent."""
-_LARGEST_HEADER = 4096
+_MAX_HEADER = 4096
 _DAMAGE = (
     *(OSError, EOFError, ValueError, TypeError, SyntaxError, ArithmeticError, RecursionError),
     *(MemoryError, NotImplementedError, RuntimeError, tokenize.TokenError),
@@ -98,7 +98,7 @@ def require_same_camera(stored: StoredDepth, camera: Camera, extent: float) -> N
     """
     height, width = stored.depth.shape
     across, down = width / camera.width, height / camera.height
-    if not abs(across / down - 1) <= LARGEST_ASPECT_CHANGE:
+    if not abs(across / down - 1) <= MAX_ASPECT_CHANGE:
         raise InputError(
             f"{stored.file}: has {height} x {width} values (height x width), but the photograph "
             f"is of {camera.height} x {camera.width} pixels; a file must cover the whole of it"
@@ -108,7 +108,7 @@ def require_same_camera(stored: StoredDepth, camera: Camera, extent: float) -> N
         ours, theirs = scaled.cpu(), stored.intrinsics
         focal = (theirs.diagonal()[:2] / ours.diagonal()[:2] - 1).abs().max()
         shift = ((theirs - ours)[:2, 2] / torch.tensor([width, height])).abs().max()
-        if not (focal <= LARGEST_FOCAL_CHANGE and shift <= LARGEST_SHIFT):
+        if not (focal <= MAX_FOCAL_CHANGE and shift <= MAX_SHIFT):
             raise InputError(
                 f"{stored.file}: its focal length and principal point {_lens(theirs)} are not the "
                 f"scene's {_lens(ours)} at {height} x {width}; use the scene's own intrinsics"
@@ -118,7 +118,7 @@ def require_same_camera(stored: StoredDepth, camera: Camera, extent: float) -> N
         cosine = ((ours[:3, :3] @ theirs[:3, :3].mT).trace() - 1) / 2
         turn_deg = float(cosine.clamp(-1, 1).arccos().rad2deg())
         step = float((_center(ours) - _center(theirs)).norm()) / max(extent, 1e-12)
-        if not (turn_deg <= LARGEST_TURN_DEG and step <= LARGEST_STEP):
+        if not (turn_deg <= MAX_TURN_DEG and step <= MAX_STEP):
             raise InputError(
                 f"{stored.file}: its world_to_cam is turned by {turn_deg:.1f}° and moved by "
                 f"{step:.0%} of the cameras' extent against the scene's; store the scene's own "
@@ -175,7 +175,7 @@ def _read_array(stream: IO[bytes]) -> Float[np.ndarray, "..."]:
         (1, 0): np.lib.format.read_array_header_1_0,
         (2, 0): np.lib.format.read_array_header_2_0,
     }[np.lib.format.read_magic(stream)]
-    shape, is_fortran, dtype = read_header(stream, max_header_size=_LARGEST_HEADER)
+    shape, is_fortran, dtype = read_header(stream, max_header_size=_MAX_HEADER)
     count = int(np.prod(shape, dtype=object))
     if dtype.kind not in "fiu" or not 0 < count <= MAX_PIXELS:
         raise ValueError(f"it holds {dtype} of shape {shape}")

@@ -21,7 +21,7 @@ from extrap_train.views import View, combine
 LOG = logging.getLogger(__name__)
 MIN_PARALLAX_RAD = 0.02
 """About 1°: below it a match says little of depth."""
-LARGEST_ERROR = 0.003
+MAX_ERROR = 0.003
 """From the epipolar line, as a share of the picture's longer side; at least a pixel."""
 MIN_POINTS = 20
 EXPLAINED = 0.05
@@ -148,7 +148,7 @@ class MonocularDepth:
     def _points(self, view: View, helper: View) -> _Points:
         matches = self.matcher.match(view.image, helper.image)
         found = triangulate(matches.first, matches.second, view.camera, helper.camera)
-        largest = max(1.0, LARGEST_ERROR * max(view.image.shape[1:]))
+        largest = max(1.0, MAX_ERROR * max(view.image.shape[1:]))
         good = (found.depth > 0) & (found.error <= largest)
         good &= found.parallax_rad >= MIN_PARALLAX_RAD
         # The error of an inverse depth is the pixel's over the parallax.

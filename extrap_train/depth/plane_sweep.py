@@ -17,7 +17,7 @@ from extrap_train.views import View
 
 COARSEST_STEP = 2.0
 """Most pixels between two planes in a neighbour: the sweep's image is made as small as needed."""
-SMALLEST_SIDE = 64
+MIN_SIDE = 64
 """The sweep's image keeps at least this many pixels on its longer side."""
 REFINEMENT_STEPS = 3
 """Hypotheses on either side of the estimate that is refined."""
@@ -94,7 +94,7 @@ def _halve(view: View, times: int) -> View:
 def _halvings(view: View, neighbours: list[View], step: float, bounds: tuple[float, float]) -> int:
     """How often to halve the image so that neighbouring planes lie about a pixel apart."""
     longer = max(view.camera.height, view.camera.width)
-    allowed = max(0, int(math.log2(longer / SMALLEST_SIDE)))
+    allowed = max(0, int(math.log2(longer / MIN_SIDE)))
     spacing = _plane_spacing(view, neighbours, step, bounds)
     if not 0 < spacing < math.inf:  # no neighbour sees the planes move: the matching says so
         return 0

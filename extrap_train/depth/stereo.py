@@ -184,7 +184,7 @@ def _check(
     return DepthMap(1 / own.inverse_depth, own.correlation * agreement(torch.stack(errors)))
 
 
-LARGEST_ERROR = 2.0
+MAX_ERROR = 2.0
 """Forward-backward error, in pixels, from which two depths contradict each other."""
 
 
@@ -215,5 +215,5 @@ def agreement(errors: Float[Tensor, "k h w"]) -> Float[Tensor, "h w"]:
 
     Only half of them have to agree: a point may be hidden from the others.
     """
-    each = torch.where(errors < LARGEST_ERROR, (-errors.square() / 2).exp(), 0)
+    each = torch.where(errors < MAX_ERROR, (-errors.square() / 2).exp(), 0)
     return each.sort(0, descending=True).values[: (len(each) + 1) // 2].mean(0)

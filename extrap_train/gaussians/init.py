@@ -137,7 +137,7 @@ RATIO = 0.8
 EPIPOLAR_SHARE = 0.006
 """Farthest a match may lie from its epipolar line, as a share of the longer side."""
 
-LARGEST_ERROR_SHARE = 0.006
+MAX_ERROR_SHARE = 0.006
 """Reprojection error from which a point is dropped, as a share of the image's longer side."""
 MIN_ANGLE_RAD = 0.026
 """Smaller angles (1.5°) between a point's rays leave its depth open."""
@@ -209,7 +209,7 @@ def _point(
     if not np.isfinite(point).all() or (cam[:, 2] <= 0).any():
         return None
     error = np.linalg.norm(cam[:, :2] / cam[:, 2:] - pixels, axis=1)
-    limits = [LARGEST_ERROR_SHARE * max(camera.height, camera.width) for camera in cameras]
+    limits = [MAX_ERROR_SHARE * max(camera.height, camera.width) for camera in cameras]
     if (error > limits).any() or _widest_angle(point, cameras) < MIN_ANGLE_RAD:
         return None
     return np.append(point, _color(pixels, seen))

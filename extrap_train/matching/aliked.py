@@ -12,7 +12,7 @@ from extrap_train.config import AlikedMatcherConfig
 from extrap_train.matching import Matches, is_known_at, resize, to_image_pixels
 from extrap_train.weight_files import WeightFile
 
-LARGEST_RATIO = 0.9
+MAX_RATIO = 0.9
 """Largest ratio of the distances to the nearest and second nearest descriptor, both ways."""
 CONSTANTS = ("dkd.hw_grid",)
 """The detector's constants: part of its state, but not of the published file."""
@@ -38,7 +38,7 @@ class AlikedMatcher:
         """Matches that are unique in both pictures; on the device of `first`."""
         points, descriptors = self._features(first)
         others, other_descriptors = self._features(second)
-        ratios, pairs = match_smnn(descriptors, other_descriptors, LARGEST_RATIO)
+        ratios, pairs = match_smnn(descriptors, other_descriptors, MAX_RATIO)
         matches = Matches(
             points[pairs[:, 0]].to(first),
             others[pairs[:, 1]].to(first),

@@ -17,9 +17,9 @@ from extrap_train.geometry.ncc import windowed_correlation
 from extrap_train.geometry.resample import fill_holes, sample_pixels
 from extrap_train.matching import DenseFlow, Matches, resize, to_grey
 
-LARGEST_ENLARGEMENT = 2.0
+MAX_ENLARGEMENT = 2.0
 """Enlarged twice, small pictures are matched to about a tenth of a pixel; more brings nothing."""
-LARGEST_ERROR = 2.0
+MAX_ERROR = 2.0
 """Forward-backward error, in pixels, from which both directions contradict each other."""
 MIN_SIDE = 16
 """Smaller pictures have no room for the search's patches, and are padded."""
@@ -58,14 +58,14 @@ class FlowMatcher:
         found, inside = _sample(torch.cat([there, backward]), forward)
         error = (forward + found[3:]).norm(dim=0)
         correlation = windowed_correlation(filled, found[:3], known)
-        sure = inside & (known > 0) & (error < LARGEST_ERROR)
+        sure = inside & (known > 0) & (error < MAX_ERROR)
         confidence = torch.where(sure, correlation * (-error.square() / 2).exp(), 0)
         return DenseFlow(forward.permute(1, 2, 0).to(first), confidence.to(first))
 
     def _both_ways(
         self, first: Float[Tensor, "h w"], second: Float[Tensor, "h2 w2"]
     ) -> tuple[Float[Tensor, "2 h w"], Float[Tensor, "2 h2 w2"]]:
-        scale = min(LARGEST_ENLARGEMENT, self.config.image_size / max(*first.shape, *second.shape))
+        scale = min(MAX_ENLARGEMENT, self.config.image_size / max(*first.shape, *second.shape))
         working = [_rescale(picture, scale) for picture in (first, second)]
         size = tuple(
             max(MIN_SIDE, *sides) for sides in zip(*(x.shape for x in working), strict=True)

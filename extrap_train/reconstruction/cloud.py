@@ -12,7 +12,7 @@ from extrap_train.geometry.warp.surface import normals_from_depth
 from extrap_train.reconstruction.global_map import MAX_COMPARED, GlobalMap, MapView, Sight, look_up
 from extrap_train.views import combine
 
-LARGEST_STEP = 0.05
+MAX_STEP = 0.05
 """Relative difference of depth between neighbouring pixels that are still one surface."""
 
 
@@ -111,7 +111,7 @@ def _subdivide(
     rows = [values[kept]]
     corners, depths = _of_four(values), _of_four(view.depth)
     whole = _of_four(sound).all(0) & (_of_four(kept).sum(0) >= 2)
-    whole &= depths.amax(0) < depths.amin(0).clamp(min=1e-30) * (1 + LARGEST_STEP)
+    whole &= depths.amax(0) < depths.amin(0).clamp(min=1e-30) * (1 + MAX_STEP)
     for down in range(parts):
         for right in range(parts):
             if (down, right) == (0, 0):

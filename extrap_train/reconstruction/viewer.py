@@ -2,7 +2,6 @@
 
 import math
 import threading
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -128,12 +127,7 @@ class CloudViewer:
     def __enter__(self) -> "CloudViewer":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _face_scene(self, known: GlobalMap) -> None:

@@ -98,7 +98,7 @@ def test_a_wrong_truth_corrects_hardly_any_pair(
 ) -> None:
     """What the gate is for: without it, as many pairs come closer to a wrong truth."""
     found = corrections(apple, wrong, every=2)
-    monkeypatch.setattr(correct, "LARGEST_ACROSS", np.inf)
+    monkeypatch.setattr(correct, "MAX_ACROSS", np.inf)
     ungated = [c for c in corrections(apple, wrong, every=2) if c.flow is not None]
     moved = sum(c.flow is not None for c in found)
     gain = np.median([1 - c.error_after / c.error_before for c in ungated])

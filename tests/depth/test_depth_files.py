@@ -256,7 +256,7 @@ def test_depth_of_another_scene_is_no_input_of_a_result(tmp_path):
 
 
 def test_a_renamed_file_is_depth_of_another_photograph(tmp_path, monkeypatch):
-    """What a table or a preparation made before is made anew."""
+    """Tables and preparations are made again, since the depth may be another."""
     monkeypatch.setattr(plan, "prepare_scene", lambda *parts: parts[-1])
     np.save(tmp_path / "1.npy", np.ones((2, 2)))
     draw = Draw("apple", "one", 3, "random", 0, ("a",), ("b",))

@@ -24,8 +24,8 @@ from jaxtyping import Float
 from extrap_train.data.camera_check import require_sound
 from extrap_train.data.image_files import MAX_PIXELS
 from extrap_train.data.paths import check_relative, require_file
-from extrap_train.data.sequences import FrameSequence
-from extrap_train.data.uco3d.video_frame import VideoFrame, VideoFrames
+from extrap_train.data.sequences import Frame, FrameSequence
+from extrap_train.data.uco3d.video_frame import VideoFrame
 from extrap_train.errors import InputError, did_you_mean
 from extrap_train.geometry.foreign_cameras import Viewpoint, camera_from_viewpoint
 from extrap_train.geometry.lens import Lens
@@ -112,7 +112,7 @@ def _sequences(root: Path, condition: str, value: str) -> Iterator[FrameSequence
 
 def _frames(
     root: Path, name: str, video: str, mask: str | None, depth: str | None
-) -> tuple["VideoFrames", tuple[str, ...]]:
+) -> tuple[tuple[Frame, ...], tuple[str, ...]]:
     """The frames of a sequence in order, and why others are left out."""
     columns = ", ".join([*_FRAME_COLUMNS, *_VIEWPOINT])
     rows = _query(
@@ -141,8 +141,8 @@ def _frames(
             left_out.append(f"{root / METADATA}: {where} cannot be used ({reason})")
         else:
             one = VideoFrame(root, number, seconds, camera, lens, video, mask, depth, scale)
-            sound.append(one)
-    return VideoFrames(tuple(sound)), tuple(left_out)
+            sound.append(one.frame())
+    return tuple(sound), tuple(left_out)
 
 
 def _undistorted(

@@ -1,10 +1,9 @@
 """One frame of a uCO3D video: picture and mask at a time, depth by a number."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 import torch
@@ -96,27 +95,6 @@ class VideoFrame:
                 f"{file}: the depth of {self.name} is zero everywhere; use depth=stereo"
             )
         return torch.from_numpy(depth.astype(np.float32))
-
-
-@dataclass(frozen=True)
-class VideoFrames(Sequence[Frame]):
-    """Frames that are made when they are asked for."""
-
-    entries: tuple[VideoFrame, ...]
-
-    def __len__(self) -> int:
-        return len(self.entries)
-
-    @overload
-    def __getitem__(self, index: int) -> Frame: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> tuple[Frame, ...]: ...
-
-    def __getitem__(self, index: int | slice) -> Frame | tuple[Frame, ...]:
-        if isinstance(index, slice):
-            return tuple(entry.frame() for entry in self.entries[index])
-        return self.entries[index].frame()
 
 
 def _read_h5_map(file: Path, key: str, size: tuple[int, int]) -> Float[np.ndarray, "h w"]:

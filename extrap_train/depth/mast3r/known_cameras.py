@@ -21,7 +21,7 @@ MIN_INLIERS = 0.2
 """Share of the votes below which a camera is not found."""
 MIN_PARALLAX_RAD = math.radians(1)
 """The baseline, seen from the middle of the points: a shorter one has no reliable scale."""
-LARGEST_CONTRADICTION_RAD = math.radians(20)
+MAX_CONTRADICTION_RAD = math.radians(20)
 """Between predicted and known rotation, and between the two directions of the baseline."""
 
 
@@ -98,7 +98,7 @@ def pair_scale(
         return None
     between = float(baselines[0] @ baselines[1]) / (lengths[0] * lengths[1])
     turn = float((predicted[:3, :3] @ known[:3, :3].T).trace() - 1) / 2
-    if min(between, turn) < math.cos(LARGEST_CONTRADICTION_RAD):
+    if min(between, turn) < math.cos(MAX_CONTRADICTION_RAD):
         return None
     return lengths[1] / lengths[0]
 

@@ -19,7 +19,7 @@ from extrap_train.geometry.warp.splat import ScreenPoints
 from extrap_train.geometry.warp.surface import Surface, plane_vectors, surface_from_depth
 from extrap_train.views import Camera
 
-LARGEST_SPACING = 1.05
+MAX_SPACING = 1.05
 """Query pixels between neighbouring points of a surface: every pixel centre then lies well inside
 a footprint."""
 REACH_MARGIN = 0.03
@@ -56,7 +56,7 @@ def sample_surfaces(
     towards = plane_vectors(surface, cameras) * query_centers(cameras, query)[..., None, None, :]
     x, y, z = towards.unbind(-1)
     drawn = surface.valid & (x + y + z < 1)
-    # Cut every pixel into as many points as keep them `LARGEST_SPACING` apart in the query.
+    # Cut every pixel into as many points as keep them `MAX_SPACING` apart in the query.
     matrix = reference_to_query_pixels(cameras, query)
     steps = _query_steps(surface, matrix)
     counts = torch.where(drawn[..., None], _points_per_axis(steps), 0).reshape(-1, 2)
@@ -119,10 +119,10 @@ def _query_steps(
 
 
 def _points_per_axis(steps: Float[Tensor, "b k h w 2 2"]) -> Int[Tensor, "b k h w 2"]:
-    """Points along u and v that keep their spacing in the query below `LARGEST_SPACING`."""
+    """Points along u and v that keep their spacing in the query below `MAX_SPACING`."""
     across, down = steps.detach().square().unbind(-1)
     length = (across + down).sqrt()
-    return (length / LARGEST_SPACING).clamp(max=MAX_POINTS_PER_AXIS).ceil().clamp(min=1).long()
+    return (length / MAX_SPACING).clamp(max=MAX_POINTS_PER_AXIS).ceil().clamp(min=1).long()
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from extrap_train.geometry.warp.surface_numba import find_surface
 from extrap_train.views import Camera
 
 _ZERO, _HALF, _ONE, _TWO = (np.float32(x) for x in (0, 0.5, 1, 2))
-_LARGEST_SPACING = np.float32(sample.LARGEST_SPACING)
+_MAX_SPACING = np.float32(sample.MAX_SPACING)
 _REACH_MARGIN = np.float32(sample.REACH_MARGIN)
 _MAX_POINTS = sample.MAX_POINTS_PER_AXIS
 _MIN_RATIO = np.float32(MIN_DEPTH_RATIO)
@@ -200,7 +200,7 @@ def _step(m, u, v, ratio, axis, slope):
 
 @compiled()
 def _points_along(across, down):
-    length = np.float32(math.sqrt(across * across + down * down)) / _LARGEST_SPACING
+    length = np.float32(math.sqrt(across * across + down * down)) / _MAX_SPACING
     return max(math.ceil(min(length, np.float32(_MAX_POINTS))), 1)
 
 

@@ -23,7 +23,7 @@ DEPTH_NOISE = 0.02
 """Steps up to this share of the depth are not edges: sensors and estimates are as noisy."""
 NEVER_SURFACE = 30.0
 """Tangent beyond which they never do (88°)."""
-LARGEST_BEND = 0.7
+MAX_BEND = 0.7
 """In between: largest change of slope from pixel to pixel that a surface may have, as a share of
 the slope."""
 
@@ -159,6 +159,6 @@ def _on_a_line(
     """
     step = (slope[..., 1:] - slope[..., :-1]).abs()
     largest = torch.maximum(slope[..., 1:].abs(), slope[..., :-1].abs())
-    similar = both[..., 1:] & both[..., :-1] & (step <= LARGEST_BEND * largest)
+    similar = both[..., 1:] & both[..., :-1] & (step <= MAX_BEND * largest)
     three = functional.pad(similar[..., 1:] & similar[..., :-1], (2, 2))
     return three[..., 2:] | three[..., 1:-1] | three[..., :-2]

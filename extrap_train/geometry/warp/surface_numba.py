@@ -13,7 +13,7 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 _ALWAYS_SURFACE = np.float32(surface.ALWAYS_SURFACE)
 _NEVER_SURFACE = np.float32(surface.NEVER_SURFACE)
 _DEPTH_NOISE = np.float32(surface.DEPTH_NOISE)
-_LARGEST_BEND = np.float32(surface.LARGEST_BEND)
+_MAX_BEND = np.float32(surface.MAX_BEND)
 
 _UNKNOWN, _LINKED, _RISES, _FALLS = 0, 1, 2, 3
 """What a step from one pixel to the next is; at a jump inverse depth rises or falls."""
@@ -96,7 +96,7 @@ def _bends_little(inverse, line, i):
     )
     first, second = here - before, after - here
     known = min(before, here, after) > 0
-    return bool(known and abs(second - first) <= _LARGEST_BEND * max(abs(first), abs(second)))
+    return bool(known and abs(second - first) <= _MAX_BEND * max(abs(first), abs(second)))
 
 
 @compiled()

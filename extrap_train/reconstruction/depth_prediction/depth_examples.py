@@ -33,7 +33,7 @@ MAX_INPUTS = 6
 """Most photographs that a capture is completed from; the fewest are three."""
 STEP_DEG = (22.0, 40.0)
 """Range of the angle between neighbouring views of the orbit."""
-LARGEST_ERROR = 0.04
+MAX_ERROR = 0.04
 """Relative error of the depths that views enter the map with: one standard deviation, at most."""
 _KNOTS = 5
 """Knots of the smooth error field of a depth map, along each side."""
@@ -71,7 +71,7 @@ def draw_examples(
     photographs = [frame.load() for frame in chosen]
     views, confidences = first_views(photographs, measuring, world, generator.warp_size)
     options = CompletionConfig(confidence=ConfidenceConfig(regenerate=False))
-    recorder = _Recorder(truth, world, source, rng.uniform(0, LARGEST_ERROR), rng)
+    recorder = _Recorder(truth, world, source, rng.uniform(0, MAX_ERROR), rng)
     pipeline = CompletionPipeline(generator, source, options, int(rng.integers(2**31)), recorder)
     scene_map = map_of_inputs(views, confidences, options.tolerance)
     queries = orbit_queries(scene_map.cameras, np.radians(rng.uniform(*STEP_DEG)))
@@ -104,7 +104,7 @@ class _Recorder:
         depth = depth / self.world.unit
         self.examples.append(with_truth(seen, depth, mask))
         error = self.error * _smooth_field(depth.shape, self.rng)
-        confidence = (1 - error.abs() / LARGEST_ERROR).clamp(0.1, 0.9)
+        confidence = (1 - error.abs() / MAX_ERROR).clamp(0.1, 0.9)
         certain = seen.certain[0]
         spoiled = depth * (1 + torch.where(certain, 0, error))
         completed = PredictedDepth(spoiled, confidence, certain)

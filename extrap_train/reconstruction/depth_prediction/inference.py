@@ -25,7 +25,7 @@ EDGE = 0.03
 """Difference of log depth between neighbours that are two surfaces."""
 LEAK = 1e-3
 """How fast the correction at the rim fades: over about 1/sqrt(LEAK) pixels."""
-LARGEST_CORRECTION = 0.1
+MAX_CORRECTION = 0.1
 """Difference of log depth at the rim above which the network shows another surface."""
 
 
@@ -113,7 +113,7 @@ def fit_to_known(
     The correction is carried along the network's own surfaces and fades with the distance.
     """
     off = torch.where(certain, known_log_depth - log_depth, 0)
-    fits = certain & (off.abs() < LARGEST_CORRECTION)
+    fits = certain & (off.abs() < MAX_CORRECTION)
     if not fits.any() or fits.all():
         return torch.where(certain, known_log_depth, log_depth)
     ties = neighbour_ties(log_depth.double().numpy()[..., None] / EDGE)

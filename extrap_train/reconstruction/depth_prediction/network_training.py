@@ -29,7 +29,7 @@ from extrap_train.store.atomic import atomic_file, save_array
 
 LEARNING_RATE = 1e-3
 WEIGHT_DECAY = 0.01
-LARGEST_GRADIENT = 1.0
+MAX_GRADIENT = 1.0
 _ENTRIES: dict[str, type] = {"step": int, "network": dict, "average": dict, "optimizer": dict}
 """What training cannot be resumed without."""
 _TRUTH, _WEIGHT = CHANNELS, CHANNELS + 1
@@ -93,7 +93,7 @@ class DepthTraining:
         loss = loss_of(self.network, examples.batch(self.options.batch_size, rng))
         self.optimizer.zero_grad()
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), LARGEST_GRADIENT)
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), MAX_GRADIENT)
         self.optimizer.step()
         self.average.update_parameters(self.network)
         self.step += 1
@@ -149,7 +149,7 @@ class DepthScores:
     within: float
     """Share of the pixels within `CONFIDENT_WITHIN`."""
     confident: float
-    """Share of the pixels whose confidence is .5 or more."""
+    """Share of the pixels with a confidence of at least .5."""
     confident_and_within: float
     """Share of the confident pixels within `CONFIDENT_WITHIN`."""
     calibration_error: float

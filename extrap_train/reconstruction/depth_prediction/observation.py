@@ -14,7 +14,7 @@ from extrap_train.views import Camera
 CHANNELS = 19
 ENTRY, CERTAIN, MEASURED = 10, 14, 15
 """Channels that others read: where the network's answer starts, and where it is known."""
-LARGEST_UNOBSERVED = 0.04
+MAX_UNOBSERVED = 0.04
 """In radii of the ball: with more unobserved space in front of it, a warped surface is a
 hypothesis."""
 FARTHEST = 2.0
@@ -68,7 +68,7 @@ def observe(
     center_depth = (center_depth + query.world_to_cam[:, 2, 3]).clamp(min=1e-6)
     scale = center_depth[:, None, None]
     unobserved = seen.unobserved / ball.radius[:, None, None]
-    certain = (surface > 0) & (unobserved <= LARGEST_UNOBSERVED)
+    certain = (surface > 0) & (unobserved <= MAX_UNOBSERVED)
     warped = _log(surface / scale)
     prior = fill_holes(warped[:, None], certain.to(warped.dtype))[:, 0]
     enters = seen.entry.isfinite()

@@ -16,7 +16,6 @@ from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from queue import SimpleQueue
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -91,16 +90,11 @@ class Studio:
     def __enter__(self) -> "Studio":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._exits.close()
 
     def do_next(self) -> None:
-        """Do what was asked for first; waits until something is. What fails is told on the page."""
+        """Wait for the next request and carry it out; its failure is shown on the page."""
         label, job = self._jobs.get()
         self._notes.lines.clear()
         self._show_state(f"{label} …", busy=True)
