@@ -42,7 +42,7 @@ from extrap_train.config import (
     options_of,
     validate,
 )
-from extrap_train.errors import InputError, ends_in_one_line
+from extrap_train.errors import InputError, ends_in_one_line, signals_outlive_errors
 from extrap_train.store import Outcome
 from extrap_train.terminal import terminal
 
@@ -116,7 +116,8 @@ def _compose(options: CommandOptions, run: Callable[[Any], Outcome | Path | None
     @hydra.main(version_base="1.3", config_path="pkg://conf", config_name=options.config_name)
     def composed(config: DictConfig) -> Outcome | Path | None:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
-            return checked(config)  # the other jobs of a sweep still run
+            with signals_outlive_errors():  # other jobs run on after a job's error
+                return checked(config)
         with ends_in_one_line():  # before Hydra adds a line of its own
             return checked(config)
 

@@ -53,9 +53,10 @@ def ends_in_one_line() -> Iterator[None]:
     Anything else is a bug and keeps its traceback.
     """
     _open_closed_streams()
-    with _sigterm_raises():
+    with _signals_raise():
         try:
-            yield
+            with signals_outlive_errors():
+                yield
             sys.stdout.flush()  # report a failure here, not while the interpreter exits
         except InputError as error:
             raise _end(1, f"error: {error}") from None
@@ -119,17 +120,47 @@ def _open_closed_streams() -> None:
             setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115, PTH123
 
 
+class _Raises:
+    """A handler that raises `kind`, and remembers that it did."""
+
+    def __init__(self, kind: type[KeyboardInterrupt]) -> None:
+        self.kind = kind
+        self.has_raised = False
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        """Python's hook."""
+        self.has_raised = True
+        raise self.kind
+
+
 @contextmanager
-def _sigterm_raises() -> Iterator[None]:
+def signals_outlive_errors() -> Iterator[None]:
+    """Raise the signal that came within the block where the block ends with an error instead.
+
+    A library may answer any exception with one of its own: an import of numba that is stopped ends
+    with an ImportError, which would be a bug's traceback or the failure of one job among others.
+    """
+    try:
+        yield
+    except Exception:
+        for number in (signal.SIGTERM, signal.SIGINT):
+            handler = signal.getsignal(number)
+            if isinstance(handler, _Raises) and handler.has_raised:
+                raise handler.kind from None
+        raise
+
+
+@contextmanager
+def _signals_raise() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield  # handlers are the main thread's
         return
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        raise Terminated
-
-    before = signal.signal(signal.SIGTERM, stop)
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    signal.signal(signal.SIGTERM, _Raises(Terminated))
+    if before[signal.SIGINT] is signal.default_int_handler:  # not where a shell ignores it
+        signal.signal(signal.SIGINT, _Raises(KeyboardInterrupt))
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)

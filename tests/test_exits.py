@@ -16,6 +16,13 @@ def _raise(error: BaseException) -> None:
     raise error
 
 
+def _taken_for_an_error(number: signal.Signals) -> None:
+    try:
+        os.kill(os.getpid(), number)
+    except KeyboardInterrupt:
+        raise ImportError("a library stopped within its import") from None
+
+
 def _terminated_with_advice() -> None:
     try:
         os.kill(os.getpid(), signal.SIGTERM)
@@ -31,6 +38,8 @@ def _terminated_with_advice() -> None:
         (lambda: _raise(KeyboardInterrupt("kept step 3")), 130, "interrupted: kept step 3"),
         (lambda: os.kill(os.getpid(), signal.SIGINT), 130, "interrupted: "),
         (lambda: os.kill(os.getpid(), signal.SIGTERM), 143, "terminated: run the same command"),
+        (lambda: _taken_for_an_error(signal.SIGINT), 130, "interrupted: "),
+        (lambda: _taken_for_an_error(signal.SIGTERM), 143, "terminated: "),
         (_terminated_with_advice, 143, "terminated: kept step 3"),
     ],
 )
