@@ -5,7 +5,7 @@ before anything of that size is allocated, and what cannot be used raises `Input
 
 | step | modules |
 |---|---|
-| a capture by what a person typed | `scene_spec` |
+| a capture by what a person typed | `scene_spec` (`archives`) |
 | its description | `co3d`, `uco3d`, `transforms_json` (`lens_keys`), `colmap`, `synthetic` |
 | photographs that come without one | `estimated_poses` (`structure_from_motion`) |
 | from descriptions to frames not yet read | `listed_photographs`, `listed_files`, `sequences` |

@@ -9,7 +9,6 @@ import importlib.util
 import json
 import logging
 import math
-import re
 import shutil
 import subprocess
 import sys
@@ -36,8 +35,8 @@ from extrap_train.data.structure_from_motion import (
     write_job,
 )
 from extrap_train.errors import InputError
-from extrap_train.store.atomic import atomic_folder, remove_leftovers
-from extrap_train.store.digests import cache_folder, file_digest, folder_digest
+from extrap_train.store.cache import cache_entry, fill_entry
+from extrap_train.store.digests import file_digest, folder_digest
 from extrap_train.terminal import progress
 
 MAX_PICTURES = 1000
@@ -76,20 +75,11 @@ def read_unposed(folder: Path, pictures: Sequence[str], name: str) -> FrameSeque
     pictures = _select_present(folder, pictures)
     settings = {"max_side": MAX_SIDE, "max_features": MAX_FEATURES, "seed": SEED}
     content = json.dumps([settings, {p: file_digest(folder / p) for p in sorted(pictures)}])
-    key = hashlib.sha256(content.encode()).hexdigest()[:16]
-    plain_name = re.sub(r"[^\w.-]", "_", name)[:60]
-    stored = cache_folder("poses") / f"{plain_name}-{key}"
+    stored = cache_entry("poses", name, hashlib.sha256(content.encode()).hexdigest())
     if not _is_sound(stored):
-        try:
-            remove_leftovers(stored.parent)
-            with atomic_folder(stored, _is_sound) as made:
-                _estimate(folder, pictures, made)
-                (made / _SEAL).write_text(folder_digest(made / "sparse"))
-        except OSError as error:
-            raise InputError(
-                f"{error.filename or stored}: {error.strerror}, so that estimated cameras cannot "
-                "be kept; set XDG_CACHE_HOME to a folder of yours with room"
-            ) from None
+        with fill_entry(stored, _is_sound, "estimated cameras") as made:
+            _estimate(folder, pictures, made)
+            (made / _SEAL).write_text(folder_digest(made / "sparse"))
         log.warning("%s: cameras estimated from the photographs are kept in %s", folder, stored)
     sequence = read_model(stored / "sparse" / "0", folder, name, upright=True)
     placed = {frame.name for frame in sequence.frames}

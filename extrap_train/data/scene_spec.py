@@ -1,9 +1,11 @@
 """One capture by what a person typed as `scene=`."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from extrap_train.config import SyntheticConfig
 from extrap_train.data import uco3d
+from extrap_train.data.archives import is_archive, unpack_archive
 from extrap_train.data.camera_check import CO3D_POSES, find_pose_fault
 from extrap_train.data.co3d import FRAME_ANNOTATIONS, read_sequence
 from extrap_train.data.colmap import find_model, read_model
@@ -20,7 +22,8 @@ SYNTHETIC_SCHEME = "synthetic:"
 KNOWN_FORMS = (
     "co3d:ROOT/category/sequence, uco3d:ROOT/supercategory/category/sequence, a folder with a "
     "transforms.json, a folder with a COLMAP model "
-    "(sparse/0 beside images), a folder of photographs, or synthetic:category/0003"
+    "(sparse/0 beside images), a folder of photographs, a .zip of such a folder, or "
+    "synthetic:category/0003"
 )
 
 _CAMERA_FILES = (
@@ -42,9 +45,15 @@ def open_scene(spec: str, synthetic: SyntheticConfig | None = None) -> FrameSequ
         return _open_co3d(spec)
     if spec.startswith(UCO3D_SCHEME):
         return _open_uco3d(spec)
-    folder = _expand_home(spec)
-    if not folder.is_dir():
+    path = _expand_home(spec)
+    if is_archive(path):
+        return replace(_open_folder(unpack_archive(path), spec), name=path.stem)
+    if not path.is_dir():
         raise InputError(f"scene {spec!r}: no such folder; give {KNOWN_FORMS}")
+    return _open_folder(path, spec)
+
+
+def _open_folder(folder: Path, spec: str) -> FrameSequence:
     if (folder / TRANSFORMS).is_file():
         return read_transforms(folder)
     name = folder.resolve().name
