@@ -34,6 +34,7 @@ GROUPS: dict[str, list[type]] = {
         schema.FlowMatcherConfig,
         schema.LoftrMatcherConfig,
         schema.AlikedMatcherConfig,
+        schema.Mast3rMatcherConfig,
         schema.OwnMatcherConfig,
     ],
     "launcher": [schema.LocalConfig, schema.SlurmConfig],

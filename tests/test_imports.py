@@ -22,6 +22,7 @@ _ORDER = (
     "extrap_train.jobs",
     "extrap_train.processes",
     "extrap_train.metrics",
+    "extrap_train.depth.mast3r.network",
     "extrap_train.matching",
     "extrap_train.data.paths",
     "extrap_train.data.image_files",

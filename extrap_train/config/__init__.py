@@ -37,6 +37,7 @@ from extrap_train.config.data_sources import (
     FlowMatcherConfig,
     LoftrMatcherConfig,
     Mast3rConfig,
+    Mast3rMatcherConfig,
     MatcherConfig,
     MonocularConfig,
     OwnDepthConfig,

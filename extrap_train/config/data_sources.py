@@ -194,6 +194,25 @@ class AlikedMatcherConfig(MatcherConfig):
     weights: ClassVar[str] = "aliked-n16.pth of github.com/Shiaoming/ALIKED"
 
 
+_MAST3R_WEIGHTS = "MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric.pth of github.com/naver/mast3r"
+
+
+@dataclass
+class Mast3rMatcherConfig(MatcherConfig):
+    """MASt3R's descriptors: dense, across wide baselines and weak texture."""
+
+    name: str = "mast3r"
+    checkpoint: str | None = option(None, "file of weights; required")
+    image_size: int = option(
+        512,
+        "longer side that the network sees: what its weights were trained on",
+        unit="pixels",
+        low=16,
+        high=8192,
+    )
+    weights: ClassVar[str] = f"weights of MASt3R, for instance {_MAST3R_WEIGHTS}"
+
+
 @dataclass
 class OwnMatcherConfig(MatcherConfig):
     """A class with the protocol of `extrap_train/matching`, named by a YAML."""
@@ -238,10 +257,7 @@ class Mast3rConfig(DepthConfig):
 
     name: str = "mast3r"
     checkpoint: str | None = option(None, "file of weights; required")
-    weights: ClassVar[str] = (
-        "weights of MASt3R or DUSt3R, for instance "
-        "MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric.pth of github.com/naver/mast3r"
-    )
+    weights: ClassVar[str] = f"weights of MASt3R or DUSt3R, for instance {_MAST3R_WEIGHTS}"
     neighbours: int = option(4, "most pairs per view", low=1, high=64)
     image_size: int = option(
         512,

@@ -11,6 +11,7 @@ from extrap_train.config import (
     FilesDepthConfig,
     LoftrMatcherConfig,
     Mast3rConfig,
+    Mast3rMatcherConfig,
     MonocularConfig,
     OwnDepthConfig,
     OwnMatcherConfig,
@@ -20,7 +21,7 @@ from extrap_train.config import (
 )
 from extrap_train.depth import DatasetDepth, DepthSource
 from extrap_train.depth.files import FilesDepth
-from extrap_train.depth.mast3r.mast3r_checkpoint import read_network
+from extrap_train.depth.mast3r.network.mast3r_checkpoint import read_network
 from extrap_train.depth.mast3r.source import Mast3rDepth
 from extrap_train.depth.monocular import MonocularDepth
 from extrap_train.depth.stereo import PlaneSweepStereo
@@ -69,7 +70,7 @@ def depth_source(config: DepthConfig, device: torch.device | None = None) -> Dep
 def weight_files(options: object) -> list[Path]:
     """The files that decide what a source or a matcher says: weights, depth maps, code of yours."""
     match options:
-        case Mast3rConfig() | LoftrMatcherConfig() | AlikedMatcherConfig():
+        case Mast3rConfig() | Mast3rMatcherConfig() | LoftrMatcherConfig() | AlikedMatcherConfig():
             return [Path(options.checkpoint or "")]
         case MonocularConfig():
             from extrap_train.depth.depth_anything import files_read

@@ -8,6 +8,7 @@ from extrap_train.config import (
     AlikedMatcherConfig,
     FlowMatcherConfig,
     LoftrMatcherConfig,
+    Mast3rMatcherConfig,
     MatcherConfig,
     OwnMatcherConfig,
     required_file,
@@ -42,6 +43,11 @@ def matcher(
 
             aliked = read_aliked(_weights(config, option), config, f"{option}.checkpoint")
             return AlikedMatcher(config, aliked.to(device))
+        case Mast3rMatcherConfig():
+            from extrap_train.matching.mast3r import Mast3rMatcher, read_mast3r
+
+            mast3r = read_mast3r(_weights(config, option), option)
+            return Mast3rMatcher(config, mast3r.to(device), option)
         case OwnMatcherConfig():
             name, prefix = f"{option}={config.name}", f"{option}.options."
             own: Matcher = make_object(config.factory, config.options, name, Matcher, prefix)
@@ -50,5 +56,7 @@ def matcher(
             raise InputError(f"{option}={config.name}: is not a matcher that this project knows")
 
 
-def _weights(config: LoftrMatcherConfig | AlikedMatcherConfig, option: str) -> Path:
+def _weights(
+    config: LoftrMatcherConfig | AlikedMatcherConfig | Mast3rMatcherConfig, option: str
+) -> Path:
     return Path(required_file(config.checkpoint, f"{option}.checkpoint", config.weights))

@@ -30,7 +30,7 @@ from extrap_train.config import (
 from extrap_train.data.prepared import PreparedData
 from extrap_train.data.sequences import FrameSequence
 from extrap_train.depth import DatasetDepth
-from extrap_train.depth.mast3r.point_map_network import Architecture, PointMapNetwork
+from extrap_train.depth.mast3r.network.point_map_network import Architecture, PointMapNetwork
 from extrap_train.errors import InputError
 
 THIN = Architecture(

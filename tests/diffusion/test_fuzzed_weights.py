@@ -30,7 +30,7 @@ from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, D
 
 from extrap_train.config import AlikedMatcherConfig, LoftrMatcherConfig, LoraConfig, ModelConfig
 from extrap_train.depth.depth_anything import read_depth_anything
-from extrap_train.depth.mast3r.mast3r_checkpoint import read_network
+from extrap_train.depth.mast3r.network.mast3r_checkpoint import read_network
 from extrap_train.diffusion.lora import AdapterOrigin, add_adapter, load_adapter, save_adapter
 from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.model_files import initial_model, load_model, save_model

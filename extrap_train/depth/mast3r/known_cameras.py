@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrap_train.depth import DepthMap
-from extrap_train.depth.mast3r.point_map_network import PredictedPoints
+from extrap_train.depth.mast3r.network.point_map_network import PredictedPoints
 from extrap_train.geometry.cameras import pixel_grid, transform
 from extrap_train.views import Camera
 

@@ -12,39 +12,14 @@ from torch.nn import functional
 from extrap_train.config import Mast3rConfig
 from extrap_train.depth import DepthMap, PointMaps, point_maps_of
 from extrap_train.depth.mast3r.known_cameras import posed_depths
-from extrap_train.depth.mast3r.point_map_network import Encoding, PointMapNetwork
+from extrap_train.depth.mast3r.network.crop import Crop, crop_for, network_input
+from extrap_train.depth.mast3r.network.point_map_network import Encoding, PointMapNetwork
 from extrap_train.depth.neighbours import WIDEST_RAD, neighbours_of
 from extrap_train.errors import InputError
 from extrap_train.views import Camera, View, combine
 
 SAME_DEPTH = math.log(1.05)
 """Estimates whose logarithms differ by more mean different surfaces."""
-
-
-@dataclass(frozen=True)
-class Crop:
-    """How a view becomes the network's: resampled, then cropped around its middle."""
-
-    resized: tuple[int, int]
-    """(height, width) before the crop."""
-    top: int
-    left: int
-    height: int
-    width: int
-
-    def apply(self, view: View) -> View:
-        """The network's view; its camera sees what the crop shows."""
-        return view.resized(*self.resized).cropped(self.top, self.left, self.height, self.width)
-
-    def undo(self, depth_map: DepthMap, height: int, width: int) -> DepthMap:
-        """Depth of the crop as depth of the view that it came from; unknown (0) outside."""
-        below = self.resized[0] - self.top - self.height
-        right = self.resized[1] - self.left - self.width
-        margins = (self.left, right, self.top, below)
-        whole = DepthMap(
-            functional.pad(depth_map.depth, margins), functional.pad(depth_map.confidence, margins)
-        )
-        return whole.resized(height, width)
 
 
 @dataclass(frozen=True)
@@ -59,7 +34,7 @@ class _Prepared:
 
     def undone(self, depth_map: DepthMap) -> DepthMap:
         """Depth of what the network sees as depth of the view, where the view's picture lies."""
-        back = self.crop.undo(depth_map, self.view.camera.height, self.view.camera.width)
+        back = undo_crop(self.crop, depth_map, self.view.camera.height, self.view.camera.width)
         return combine([back], lambda tensors: tensors[0].to(self.view.image))
 
 
@@ -192,25 +167,12 @@ def weighted_median(
     return values.gather(0, order).gather(0, middle)[0]
 
 
-def crop_for(view: View, image_size: int, patch: int, square: bool) -> Crop:
-    """The longer side becomes `image_size`, both are cut to multiples of `patch`.
-
-    Unless `square`, a square picture is cut to 4:3, the squarest shape that the published networks
-    of 512 pixels know. InputError where a picture is too narrow for a single patch.
-    """
-    scale = image_size / max(view.camera.height, view.camera.width)
-    resized = round(view.camera.height * scale), round(view.camera.width * scale)
-    height, width = (side // patch * patch for side in resized)
-    if height == width and not square:
-        height = max(height * 3 // 4 // patch, 1) * patch
-    if not height or not width:
-        raise InputError(
-            f"{view.name or 'a view'}: {view.camera.height} x {view.camera.width} pixels are too "
-            f"narrow for depth.image_size={image_size}, at which a side has under {patch}"
-        )
-    return Crop(resized, (resized[0] - height) // 2, (resized[1] - width) // 2, height, width)
-
-
-def network_input(view: View, device: torch.device) -> Float[Tensor, "1 3 h w"]:
-    """Colours as the network wants them, in [−1, 1]."""
-    return (view.image[None].to(device) - 0.5) / 0.5
+def undo_crop(crop: Crop, depth_map: DepthMap, height: int, width: int) -> DepthMap:
+    """Depth of a crop as depth of the view that it came from; unknown (0) outside."""
+    below = crop.resized[0] - crop.top - crop.height
+    right = crop.resized[1] - crop.left - crop.width
+    margins = (crop.left, right, crop.top, below)
+    whole = DepthMap(
+        functional.pad(depth_map.depth, margins), functional.pad(depth_map.confidence, margins)
+    )
+    return whole.resized(height, width)

@@ -6,7 +6,7 @@ import torch
 from torch import nn
 from traced_scenes import Surface, render
 
-from extrap_train.depth.mast3r.point_map_network import (
+from extrap_train.depth.mast3r.network.point_map_network import (
     Architecture,
     Encoding,
     PointMapNetwork,

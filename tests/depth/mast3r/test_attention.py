@@ -1,6 +1,6 @@
 import torch
 
-from extrap_train.depth.mast3r.attention import ROTARY_BASE, rotate, token_positions
+from extrap_train.depth.mast3r.network.attention import ROTARY_BASE, rotate, token_positions
 
 
 def test_positions_go_row_by_row():

@@ -6,7 +6,7 @@ from oracle import exact_pair
 from traced_scenes import SCENES, orbit_camera, render
 
 from extrap_train.depth.mast3r.known_cameras import pair_scale, posed_depths, predicted_pose
-from extrap_train.depth.mast3r.point_map_network import PredictedPoints
+from extrap_train.depth.mast3r.network.point_map_network import PredictedPoints
 
 SCENE = SCENES["box on the ground"]
 FIRST, SECOND = orbit_camera(0, 64), orbit_camera(25, 64)

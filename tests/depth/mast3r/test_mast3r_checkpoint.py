@@ -8,7 +8,7 @@ from safetensors.torch import save_file
 from tiny import EXPRESSION, TINY, plain_state, write_checkpoint
 
 from extrap_train.config import Mast3rConfig
-from extrap_train.depth.mast3r.mast3r_checkpoint import read_network
+from extrap_train.depth.mast3r.network.mast3r_checkpoint import read_network
 from extrap_train.depth.sources import depth_source
 from extrap_train.errors import InputError
 

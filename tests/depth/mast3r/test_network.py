@@ -6,8 +6,8 @@ import torch
 from safetensors.torch import load_file
 from tiny import TINY, tiny_state, write_checkpoint
 
-from extrap_train.depth.mast3r.mast3r_checkpoint import read_network
-from extrap_train.depth.mast3r.point_map_network import Architecture, PointMapNetwork
+from extrap_train.depth.mast3r.network.mast3r_checkpoint import read_network
+from extrap_train.depth.mast3r.network.point_map_network import Architecture, PointMapNetwork
 
 SMALL = replace(TINY, decoder_depth=4)
 
@@ -25,6 +25,16 @@ def test_outputs_are_the_published_networks(shared, tmp_path):
         truth = expected[f"{view}.conf"]
         # 1 + exp(x): what rounding does to x grows with the confidence.
         assert torch.allclose(found.confidence, truth, rtol=1e-4, atol=0)
+
+
+@torch.no_grad()
+def test_descriptors_are_the_published_networks(shared, tmp_path):
+    network = read_network(write_checkpoint(tiny_state(shared), tmp_path / "tiny.pth"))
+    expected = load_file(shared / "fixtures" / "mast3r_tiny" / "expected.safetensors")
+    both = network.describe(*(network.encode(expected[f"image{i}"]) for i in (1, 2)))
+    for view, found in zip(("view1", "view2"), both, strict=True):
+        assert torch.allclose(found.descriptors, expected[f"{view}.desc"], atol=1e-4)
+        assert torch.allclose(found.confidence, expected[f"{view}.desc_conf"], rtol=1e-3)
 
 
 def test_names_and_shapes_are_the_published_ones(shared):

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from extrap_train.depth.mast3r.point_map_network import Architecture, PointMapNetwork
+from extrap_train.depth.mast3r.network.point_map_network import Architecture, PointMapNetwork
 
 TINY = Architecture(
     encoder_width=64,

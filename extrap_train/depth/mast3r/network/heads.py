@@ -2,11 +2,12 @@
 
 from collections.abc import Sequence
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from extrap_train.depth.mast3r.attention import Mlp
+from extrap_train.depth.mast3r.network.attention import Mlp
 
 POINT_CHANNELS = 4
 """Three coordinates and a confidence."""
@@ -112,14 +113,13 @@ class DensePrediction(nn.Module):
 
 
 class DensePointHead(nn.Module):
-    """DUSt3R's head: points and their confidence. MASt3R's has descriptors beside them, whose
-    weights are held and not used: depth is not made of them.
-    """
+    """DUSt3R's head: points and their confidence. MASt3R's has descriptors beside them."""
 
     def __init__(
         self, encoder_width: int, decoder_width: int, patch: int, descriptor_width: int | None
     ) -> None:
         super().__init__()
+        self.patch = patch
         self.dpt = DensePrediction([encoder_width, *3 * [decoder_width]])
         if descriptor_width is not None:
             out = (descriptor_width + 1) * patch**2
@@ -129,6 +129,11 @@ class DensePointHead(nn.Module):
         """`layers` are the encoder's tokens and those after every block of the decoder."""
         depth = len(layers) - 1
         return self.dpt([layers[i] for i in (0, depth // 2, depth * 3 // 4, depth)], grid)
+
+    def features(self, layers: Sequence[Tokens], grid: tuple[int, int]) -> Float[Tensor, "b _ h w"]:
+        """Descriptors and their confidence, from the last tokens of both (MASt3R, section 3.2)."""
+        tokens = torch.cat([layers[0], layers[-1]], -1)
+        return _unpatch(self.head_local_features(tokens), grid, self.patch)
 
 
 class LinearPointHead(nn.Module):

@@ -6,14 +6,15 @@ from typing import Literal
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn import functional
 
-from extrap_train.depth.mast3r.attention import (
+from extrap_train.depth.mast3r.network.attention import (
     NORM_EPS,
     DecoderBlock,
     EncoderBlock,
     token_positions,
 )
-from extrap_train.depth.mast3r.heads import POINT_CHANNELS, DensePointHead, LinearPointHead
+from extrap_train.depth.mast3r.network.heads import POINT_CHANNELS, DensePointHead, LinearPointHead
 
 Head = Literal["dense", "linear"]
 
@@ -31,9 +32,7 @@ class Architecture:
     patch: int = 16
     head: Head = "dense"
     descriptor_width: int | None = 24
-    """Width of MASt3R's descriptors, which are in the weights but not used here; None for DUSt3R,
-    which has none.
-    """
+    """Width of MASt3R's descriptors; None for DUSt3R, which has none."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +51,16 @@ class PredictedPoints:
     points: Float[Tensor, "b h w 3"]
     confidence: Float[Tensor, "b h w"]
     """From 1 (none) upwards."""
+
+
+@dataclass(frozen=True)
+class PredictedDescriptors:
+    """MASt3R's local features of one picture of a pair."""
+
+    descriptors: Float[Tensor, "b h w d"]
+    """Of unit length; the product of two is their similarity."""
+    confidence: Float[Tensor, "b h w"]
+    """Above 0."""
 
 
 class _PatchEmbedding(nn.Module):
@@ -95,6 +104,26 @@ class PointMapNetwork(nn.Module):
 
     def decode(self, first: Encoding, second: Encoding) -> tuple[PredictedPoints, PredictedPoints]:
         """Both pictures' points in the first camera's frame."""
+        ones, twos = self._decoded(first, second)
+        return (
+            _activate(self.downstream_head1(ones, first.grid)),
+            _activate(self.downstream_head2(twos, second.grid)),
+        )
+
+    def describe(
+        self, first: Encoding, second: Encoding
+    ) -> tuple[PredictedDescriptors, PredictedDescriptors]:
+        """Both pictures' local features, of a network whose `descriptor_width` is not None."""
+        ones, twos = self._decoded(first, second)
+        return (
+            _describe(self.downstream_head1, ones, first.grid),
+            _describe(self.downstream_head2, twos, second.grid),
+        )
+
+    def _decoded(
+        self, first: Encoding, second: Encoding
+    ) -> tuple[list[Float[Tensor, "b n _"]], list[Float[Tensor, "b m _"]]]:
+        """Of each picture the encoder's tokens and those after every block of the decoder."""
         here = token_positions(*first.grid, device=first.tokens.device)
         there = token_positions(*second.grid, device=second.tokens.device)
         one, two = self.decoder_embed(first.tokens), self.decoder_embed(second.tokens)
@@ -104,10 +133,7 @@ class PointMapNetwork(nn.Module):
             ones.append(one)
             twos.append(two)
         ones[-1], twos[-1] = self.dec_norm(one), self.dec_norm(two)
-        return (
-            _activate(self.downstream_head1(ones, first.grid)),
-            _activate(self.downstream_head2(twos, second.grid)),
-        )
+        return ones, twos
 
     def forward(
         self, first: Float[Tensor, "b 3 h w"], second: Float[Tensor, "b 3 h2 w2"]
@@ -128,3 +154,14 @@ def _activate(raw: Float[Tensor, "b 4 h w"]) -> PredictedPoints:
     points, confidence = values[..., : POINT_CHANNELS - 1], 1 + values[..., -1].exp()
     distance = points.norm(dim=-1, keepdim=True)
     return PredictedPoints(points / distance.clamp_min(1e-8) * distance.expm1(), confidence)
+
+
+def _describe(
+    head: nn.Module, layers: list[Float[Tensor, "b n _"]], grid: tuple[int, int]
+) -> PredictedDescriptors:
+    """The last of the head's features is the confidence's logarithm."""
+    assert isinstance(head, DensePointHead)
+    values = head.features(layers, grid).permute(0, 2, 3, 1)
+    return PredictedDescriptors(
+        functional.normalize(values[..., :-1], dim=-1), values[..., -1].exp()
+    )

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from extrap_train.config import Mast3rConfig
-from extrap_train.depth.mast3r.heads import LEVEL_WIDTHS
-from extrap_train.depth.mast3r.point_map_network import Architecture, PointMapNetwork
+from extrap_train.depth.mast3r.network.heads import LEVEL_WIDTHS
+from extrap_train.depth.mast3r.network.point_map_network import Architecture, PointMapNetwork
 from extrap_train.weight_files import WeightFile
 
 HEAD_WIDTH = 64
@@ -18,13 +18,13 @@ MAX_BLOCKS = 100
 """Most blocks of an encoder or decoder; the published ones have at most 24."""
 
 
-def read_network(path: Path) -> PointMapNetwork:
+def read_network(path: Path, option: str = "depth.checkpoint") -> PointMapNetwork:
     """The network of a MASt3R or DUSt3R file, in evaluation mode; InputError if it is none.
 
     Its sizes come from the tensors' shapes. The file also holds the Python expression that made the
     network: the numbers of heads are read out of it as text, and it is never evaluated.
     """
-    file = WeightFile(path, "depth.checkpoint", Mast3rConfig.weights)
+    file = WeightFile(path, option, Mast3rConfig.weights)
     content = file.read(inert=["argparse.Namespace"])
     state = _with_both_names(file.tensors(content, "model"))
     expression = ""
