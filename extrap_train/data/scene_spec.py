@@ -10,6 +10,7 @@ from extrap_train.data.camera_check import CO3D_POSES, find_pose_fault
 from extrap_train.data.co3d import FRAME_ANNOTATIONS, read_sequence
 from extrap_train.data.colmap import find_model, read_model
 from extrap_train.data.estimated_poses import find_pictures, read_unposed
+from extrap_train.data.polycam import find_keyframe_cameras, read_polycam
 from extrap_train.data.sequences import FrameSequence
 from extrap_train.data.synthetic.capture import synthetic_sequence
 from extrap_train.data.transforms_json import TRANSFORMS, read_transforms
@@ -21,9 +22,8 @@ UCO3D_SCHEME = "uco3d:"
 SYNTHETIC_SCHEME = "synthetic:"
 KNOWN_FORMS = (
     "co3d:ROOT/category/sequence, uco3d:ROOT/supercategory/category/sequence, a folder with a "
-    "transforms.json, a folder with a COLMAP model "
-    "(sparse/0 beside images), a folder of photographs, a .zip of such a folder, or "
-    "synthetic:category/0003"
+    "transforms.json, a COLMAP model (sparse/0 beside images) or Polycam's raw export, a folder of "
+    "photographs, a .zip of such a folder, or synthetic:category/0003"
 )
 
 _CAMERA_FILES = (
@@ -59,6 +59,8 @@ def _open_folder(folder: Path, spec: str) -> FrameSequence:
     name = folder.resolve().name
     if model := find_model(folder):
         return read_model(model, _images_folder(folder, model), name)
+    if cameras := find_keyframe_cameras(folder):
+        return read_polycam(cameras, name)
     if file := _camera_like_file(folder):
         raise InputError(
             f"scene {spec!r}: {file} describes cameras, but not in a form that is read "

@@ -1,19 +1,14 @@
 """Folders with a `transforms.json`, as nerfstudio and instant-ngp write them (OpenGL axes)."""
 
-import json
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
-
 from extrap_train.data.camera_check import OPENGL_POSES
 from extrap_train.data.depth_files import DepthFile
-from extrap_train.data.image_files import MAX_PIXELS, image_size
 from extrap_train.data.json_files import read_json, require_dict, require_list
-from extrap_train.data.lens_keys import LENS_KEYS, lens_of, merge_entry, number_of
+from extrap_train.data.lens_keys import LENS_KEYS, merge_entry, number_of
 from extrap_train.data.listed_files import ListedFiles
 from extrap_train.data.listed_photographs import (
     Listed,
@@ -22,21 +17,17 @@ from extrap_train.data.listed_photographs import (
     sequence_of_photographs,
 )
 from extrap_train.data.paths import check_relative
+from extrap_train.data.posed_entries import MILLIMETRES, names_faults, photograph_of_entry
 from extrap_train.data.sequences import FrameSequence, PointFile
 from extrap_train.errors import InputError
-from extrap_train.geometry.foreign_cameras import world_to_cam_from_opengl
 from extrap_train.views import Camera, stack_cameras
 
 TRANSFORMS = "transforms.json"
-MILLIMETRES = 0.001
-"""nerfstudio's unit of depth files, in scene units."""
 KEYS = LENS_KEYS | {
     *("w", "h", "transform_matrix", "mask_path", "ply_file_path", "applied_scale"),
     *("depth_file_path", "depth_unit_scale_factor", "depth_path", "integer_depth_scale"),
 }
 """Entries read from the top level, where they hold for all frames."""
-LAST_ROW_TOLERANCE = 1e-6
-"""Tolerance on a matrix's last row, relative to its last number."""
 
 
 def read_transforms(folder: Path) -> FrameSequence:
@@ -115,35 +106,13 @@ def _listed_picture(
 def _photograph(
     files: ListedFiles, entry: dict[str, Any], file: Path, path: str
 ) -> ListedPhotograph:
-    try:
-        height, width = _size(files.root / path, entry)
+    with names_faults(file, path):
         mask = entry.get("mask_path")
-        return ListedPhotograph(
-            image_path=path,
-            height=height,
-            width=width,
-            lens=lens_of(entry, height, width),
-            world_to_cam=world_to_cam_from_opengl(_rigid(entry["transform_matrix"])),
+        return replace(
+            photograph_of_entry(files.root, entry, path),
             depth=_depth(files, entry),
             mask_path=_find_or_keep(files, mask) if mask else None,
         )
-    except KeyError as error:
-        raise InputError(
-            f"{file}: neither the file nor its entry {path} has {error}; add it"
-        ) from None
-    except InputError:
-        raise
-    except (TypeError, ValueError, OverflowError, RuntimeError) as error:
-        raise InputError(f"{file}: entry {path} is malformed ({error}); correct it") from None
-
-
-def _size(picture: Path, entry: dict[str, Any]) -> tuple[int, int]:
-    if "h" not in entry and "w" not in entry:
-        return image_size(picture)
-    height, width = number_of(entry, "h"), number_of(entry, "w")
-    if not (height >= 1 and width >= 1 and height * width <= MAX_PIXELS):
-        raise ValueError(f"image size {height:g} x {width:g}")
-    return int(height), int(width)
 
 
 def _depth(files: ListedFiles, entry: dict[str, Any]) -> DepthFile | None:
@@ -161,28 +130,3 @@ def _depth(files: ListedFiles, entry: dict[str, Any]) -> DepthFile | None:
 def _find_or_keep(files: ListedFiles, path: Any) -> str:
     """Where a file is; where it is nowhere, its path as it stands, which reading it will report."""
     return files.find(str(path)) or str(path)
-
-
-def _rigid(rows: Any) -> Float[Tensor, "4 4"]:
-    """A matrix of a file, without the scale that its last row or its axes may have."""
-    try:
-        matrix = torch.tensor(rows, dtype=torch.float64)
-    except (TypeError, ValueError, OverflowError, RuntimeError):
-        said = json.dumps(rows)[:60]
-        raise ValueError(f"transform_matrix is {said}, expected 4 x 4 numbers") from None
-    if matrix.shape not in ((4, 4), (3, 4)):
-        raise ValueError(f"transform_matrix has shape {tuple(matrix.shape)}, expected 4 x 4")
-    if len(matrix) == 4:
-        *last, scale = matrix[3].tolist()
-        if scale == 0 or max(map(abs, last)) > LAST_ROW_TOLERANCE * abs(scale):
-            raise ValueError(
-                f"the last row of transform_matrix is {matrix[3].tolist()}, expected 0, 0, 0, 1: "
-                "is the matrix transposed (column-major)?"
-            )
-        matrix = matrix / scale
-    rotation = matrix[:3, :3]
-    size = torch.linalg.det(rotation).abs() ** (1 / 3)
-    rigid = torch.eye(4, dtype=torch.float64)
-    rigid[:3, :3] = rotation / size
-    rigid[:3, 3] = matrix[:3, 3]
-    return rigid
