@@ -35,7 +35,7 @@ class SceneOptions:
     scene: str | None = option(
         None,
         "co3d:ROOT/category/sequence, uco3d:ROOT/…/sequence, synthetic:category/0003, a "
-        "folder with transforms.json or a COLMAP model, or a folder of photographs alone",
+        "folder with transforms.json, a COLMAP model or photographs alone, or a video",
     )
     inputs: int | None = option(
         None,

@@ -8,7 +8,7 @@ before anything of that size is allocated, and what cannot be used raises `Input
 | a capture by what a person typed | `scene_spec` (`archives`) |
 | its description | `co3d`, `uco3d`, `transforms_json` (`lens_keys`), `colmap`, `synthetic` |
 | that of another program's export | `polycam` |
-| photographs that come without one | `estimated_poses` (`structure_from_motion`) |
+| photographs and videos without one | `estimated_poses` (`structure_from_motion`), `keyframes` |
 | to frames not yet read | `posed_entries`, `listed_photographs`, `listed_files`, `sequences` |
 | files to pixels | `image_files`, `video_files`, `depth_files` |
 | whether paths, JSON and cameras are sound | `paths`, `json_files`, `camera_check` |

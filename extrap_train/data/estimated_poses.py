@@ -14,6 +14,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -35,14 +36,13 @@ from extrap_train.data.structure_from_motion import (
     write_job,
 )
 from extrap_train.errors import InputError
-from extrap_train.store.cache import cache_entry, fill_entry
-from extrap_train.store.digests import file_digest, folder_digest
+from extrap_train.store.cache import cache_entry, fill_entry, is_sealed, seal
+from extrap_train.store.digests import file_digest
 from extrap_train.terminal import progress
 
 MAX_PICTURES = 1000
 PHOTOGRAPH_SUFFIXES = (*PICTURE_SUFFIXES, ".heic", ".heif")
 _MAX_NAMED = 8
-_SEAL = "sparse.sha256"
 _REMEDY = (
     "take more pictures of the textured scene in small steps around it, or give a transforms.json "
     "or COLMAP model"
@@ -76,10 +76,11 @@ def read_unposed(folder: Path, pictures: Sequence[str], name: str) -> FrameSeque
     settings = {"max_side": MAX_SIDE, "max_features": MAX_FEATURES, "seed": SEED}
     content = json.dumps([settings, {p: file_digest(folder / p) for p in sorted(pictures)}])
     stored = cache_entry("poses", name, hashlib.sha256(content.encode()).hexdigest())
-    if not _is_sound(stored):
-        with fill_entry(stored, _is_sound, "estimated cameras") as made:
+    is_sound = partial(is_sealed, part="sparse")
+    if not is_sound(stored):
+        with fill_entry(stored, is_sound, "estimated cameras") as made:
             _estimate(folder, pictures, made)
-            (made / _SEAL).write_text(folder_digest(made / "sparse"))
+            seal(made, "sparse")
         log.warning("%s: cameras estimated from the photographs are kept in %s", folder, stored)
     sequence = read_model(stored / "sparse" / "0", folder, name, upright=True)
     placed = {frame.name for frame in sequence.frames}
@@ -112,14 +113,6 @@ def _select_present(folder: Path, pictures: Sequence[str]) -> list[str]:
         else:
             present.append(name)
     return present
-
-
-def _is_sound(stored: Path) -> bool:
-    """Whether the model is there as it was written."""
-    seal = stored / _SEAL
-    if not seal.is_file():
-        return False
-    return seal.read_bytes() == folder_digest(stored / "sparse").encode()
 
 
 def _estimate(folder: Path, pictures: Sequence[str], made: Path) -> None:

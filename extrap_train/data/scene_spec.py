@@ -10,6 +10,7 @@ from extrap_train.data.camera_check import CO3D_POSES, find_pose_fault
 from extrap_train.data.co3d import FRAME_ANNOTATIONS, read_sequence
 from extrap_train.data.colmap import find_model, read_model
 from extrap_train.data.estimated_poses import find_pictures, read_unposed
+from extrap_train.data.keyframes import read_video
 from extrap_train.data.polycam import find_keyframe_cameras, read_polycam
 from extrap_train.data.sequences import FrameSequence
 from extrap_train.data.synthetic.capture import synthetic_sequence
@@ -23,7 +24,7 @@ SYNTHETIC_SCHEME = "synthetic:"
 KNOWN_FORMS = (
     "co3d:ROOT/category/sequence, uco3d:ROOT/supercategory/category/sequence, a folder with a "
     "transforms.json, a COLMAP model (sparse/0 beside images) or Polycam's raw export, a folder of "
-    "photographs, a .zip of such a folder, or synthetic:category/0003"
+    "photographs, a .zip of such a folder, a video, or synthetic:category/0003"
 )
 
 _CAMERA_FILES = (
@@ -48,9 +49,11 @@ def open_scene(spec: str, synthetic: SyntheticConfig | None = None) -> FrameSequ
     path = _expand_home(spec)
     if is_archive(path):
         return replace(_open_folder(unpack_archive(path), spec), name=path.stem)
-    if not path.is_dir():
-        raise InputError(f"scene {spec!r}: no such folder; give {KNOWN_FORMS}")
-    return _open_folder(path, spec)
+    if path.is_file():
+        return read_video(path)
+    if path.is_dir():
+        return _open_folder(path, spec)
+    raise InputError(f"scene {spec!r}: no such file or folder; give {KNOWN_FORMS}")
 
 
 def _open_folder(folder: Path, spec: str) -> FrameSequence:

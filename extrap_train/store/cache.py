@@ -7,7 +7,7 @@ from pathlib import Path
 
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import atomic_folder, remove_leftovers
-from extrap_train.store.digests import cache_folder
+from extrap_train.store.digests import cache_folder, folder_digest
 
 
 def cache_entry(kind: str, name: str, key: str) -> Path:
@@ -31,3 +31,14 @@ def fill_entry(entry: Path, is_sound: Callable[[Path], bool], content: str) -> I
             f"{error.filename or entry}: {error.strerror}, so that {content} cannot be kept; set "
             "XDG_CACHE_HOME to a folder of yours with room"
         ) from None
+
+
+def seal(made: Path, part: str) -> None:
+    """Write down what the folder `part` of an entry contains."""
+    (made / f"{part}.sha256").write_text(folder_digest(made / part))
+
+
+def is_sealed(entry: Path, part: str) -> bool:
+    """Whether the folder `part` is there as it was when it was sealed."""
+    file = entry / f"{part}.sha256"
+    return file.is_file() and file.read_bytes() == folder_digest(entry / part).encode()

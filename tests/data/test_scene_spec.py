@@ -31,8 +31,8 @@ def test_a_colmap_model(tmp_path, place):
 @pytest.mark.parametrize(
     ("spec", "expected"),
     [
-        ("synthetc:hydrant/0003", "no such folder; give co3d:ROOT/category/sequence"),
-        ("{folder}/gone", "no such folder"),
+        ("synthetc:hydrant/0003", "no such file or folder; give co3d:ROOT/category/sequence"),
+        ("{folder}/gone", "no such file or folder"),
         ("{folder}", "no camera file and no photographs"),
         ("co3d:cup/one", "is not co3d:ROOT/category/sequence"),
         ("co3d:{folder}/cup/one", "has no category 'cup'"),
