@@ -1,4 +1,5 @@
-"""Depth maps on disk to depth in scene units: CO3D's half floats, 16-bit pictures, TIFF and NPY."""
+"""Depth maps on disk to depth in scene units: CO3D's half floats, 16-bit pictures, TIFF, NPY, and
+Record3D's files."""
 
 import tokenize
 from dataclasses import dataclass
@@ -6,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
 from extrap_train.data.image_files import (
@@ -16,6 +17,7 @@ from extrap_train.data.image_files import (
     read_picture,
     same_view,
 )
+from extrap_train.data.lzfse_files import CONFIDENCE_SUFFIX, DEPTH_SUFFIX, read_lzfse_array
 from extrap_train.data.paths import require_file
 from extrap_train.errors import InputError
 
@@ -46,8 +48,9 @@ class DepthFile:
     def read(self, root: Path, size: tuple[int, int]) -> Float[Tensor, "h w"]:
         """The depth in scene units at `size` (height, width); 0 where unknown or not trusted.
 
-        A greyscale picture of 16 bits, a TIFF of 32, or an NPY array, of the shape of `size`: it is
-        resampled from the nearest pixels. An empty map, and a scale that cannot be, is an error.
+        A greyscale picture of 16 bits, a TIFF of 32, an NPY array, or a file of Record3D's, of the
+        shape of `size`: it is resampled from the nearest pixels. An empty map, and a scale that
+        cannot be, is an error.
         """
         path = root / self.path
         if self.is_half_float:
@@ -55,11 +58,13 @@ class DepthFile:
             raw = raw.astype(np.uint16).view(np.float16)
         elif path.suffix.lower() == ".npy":
             raw = _read_npy(path, size)
+        elif path.suffix == DEPTH_SUFFIX:
+            raw = read_lzfse_array(path, size, ("<f4", "<f2"))
         else:
             raw = np.asarray(read_picture(path, size, _DEPTH_MODES))
         depth = self._in_scene_units(nearest_pixels(raw, size), path)
         if self.mask_path:
-            depth *= torch.from_numpy(read_grey(root / self.mask_path, size) > 0)
+            depth *= torch.from_numpy(_read_trust(root / self.mask_path, size) > 0)
         return depth
 
     def _in_scene_units(self, raw: Shaped[np.ndarray, "h w"], path: Path) -> Float[Tensor, "h w"]:
@@ -77,6 +82,12 @@ class DepthFile:
                 "depth (depth=stereo)"
             )
         return torch.from_numpy(depth)
+
+
+def _read_trust(path: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "h w"]:
+    if path.suffix == CONFIDENCE_SUFFIX:
+        return nearest_pixels(read_lzfse_array(path, size, ("u1",)), size)
+    return read_grey(path, size)
 
 
 def _read_npy(path: Path, size: tuple[int, int]) -> Shaped[np.ndarray, "h w"]:

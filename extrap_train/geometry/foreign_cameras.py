@@ -4,7 +4,7 @@ PyTorch3D (CO3D)
     Multiplies row vectors from the left, `x_cam = x_world @ R + T`; its camera looks along +Z with
     +X to the *left* and +Y *up*. Focal length and principal point are in one of two NDC units; both
     have their origin in the image's centre and grow to the left and upwards.
-OpenGL (nerfstudio, Blender, ZeroNVS)
+OpenGL (nerfstudio, Blender, ZeroNVS, ARKit)
     Stores `cam_to_world`, with +X right, +Y up, −Z forward.
 COLMAP
     Stores world-to-camera as a quaternion (w, x, y, z) and a translation; its axes (OpenCV's) and
@@ -95,6 +95,13 @@ def world_to_cam_from_opengl(cam_to_world: Float[Tensor, "*b 4 4"]) -> Float[Ten
     return rigid_inverse(flip_up_and_forward(cam_to_world))
 
 
+def opengl_from_quaternion(
+    quaternion_xyzw: Float[Tensor, "*b 4"], translation: Float[Tensor, "*b 3"]
+) -> Float[Tensor, "*b 4 4"]:
+    """An OpenGL camera's `cam_to_world`; the quaternion may have any length but 0, which is NaN."""
+    return _rigid_transform(quaternion_xyzw, translation)
+
+
 def opengl_from_world_to_cam(world_to_cam: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
     """An OpenGL camera's `cam_to_world` from our `world_to_cam`."""
     return flip_up_and_forward(rigid_inverse(world_to_cam))
@@ -179,9 +186,7 @@ def world_to_cam_from_colmap(
     quaternion_wxyz: Float[Tensor, "*b 4"], translation: Float[Tensor, "*b 3"]
 ) -> Float[Tensor, "*b 4 4"]:
     """Our 4×4 matrix; the quaternion may have any length, but a zero one gives NaN."""
-    unit = quaternion_wxyz / quaternion_wxyz.norm(dim=-1, keepdim=True)
-    rotation = roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(unit))
-    return roma.Rigid(rotation, translation).to_homogeneous()
+    return _rigid_transform(roma.quat_wxyz_to_xyzw(quaternion_wxyz), translation)
 
 
 def colmap_from_world_to_cam(
@@ -191,3 +196,10 @@ def colmap_from_world_to_cam(
     xyzw = roma.rotmat_to_unitquat(world_to_cam[..., :3, :3])
     wxyz = roma.quat_xyzw_to_wxyz(xyzw)
     return torch.where(wxyz[..., :1] < 0, -wxyz, wxyz), world_to_cam[..., :3, 3]
+
+
+def _rigid_transform(
+    quaternion_xyzw: Float[Tensor, "*b 4"], translation: Float[Tensor, "*b 3"]
+) -> Float[Tensor, "*b 4 4"]:
+    unit = quaternion_xyzw / quaternion_xyzw.norm(dim=-1, keepdim=True)
+    return roma.Rigid(roma.unitquat_to_rotmat(unit), translation).to_homogeneous()
