@@ -201,12 +201,25 @@ def fit_orbit_of_few(cameras: Camera) -> Orbit:
     """The orbit of two or more cameras that look at a scene from one side or from all.
 
     The axis is the direction that the cameras' horizontal axes have least in common with: a few
-    photographs from one side do not show which way their positions bend, but all are held upright.
+    photographs from one side do not show which way their positions bend, but all are held upright,
+    or all on their side. The horizontal axis is the one that turns as the cameras go around: the
+    images' rows, or the columns of photographs on their side, whose orbit may be upside down. Two
+    photographs are taken as upright: they may stand above each other.
     """
-    right = cameras.world_to_cam[:, 0, :3].double().numpy(force=True)
-    axis = np.linalg.eigh(right.T @ right)[1][:, 0]
-    up = -cameras.world_to_cam[:, 1, :3].double().numpy(force=True).mean(0)
+    rows, columns = cameras.world_to_cam[:, :2, :3].double().numpy(force=True).swapaxes(0, 1)
+    (rows_turn, axis), (columns_turn, axis_on_side) = map(_least_common, (rows, columns))
+    up = -columns.mean(0)
+    if len(rows) >= MIN_VIEWS and columns_turn > rows_turn:
+        axis, up = axis_on_side, rows.mean(0)
     return Orbit.around(scene_center(cameras), axis if axis @ up > 0 else -axis, cameras)
+
+
+def _least_common(
+    directions: Float[np.ndarray, "n 3"],
+) -> tuple[float, Float[np.ndarray, "3"]]:
+    """How far directions turn about an axis, from 0 to 1/2 on average, and this axis."""
+    shares, axes = np.linalg.eigh(directions.T @ directions / len(directions))
+    return float(shares[1]), axes[:, 0]
 
 
 def orbit_cameras(views: Camera, span_rad: float, count: int) -> Camera:

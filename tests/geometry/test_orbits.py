@@ -57,3 +57,15 @@ def test_a_circle_starts_at_its_first_view_and_leans_as_its_views_do():
     np.testing.assert_allclose(circle.axis, [0, 0, 1], atol=1e-5)
     np.testing.assert_allclose(elevations, np.radians(20), atol=1e-5)
     np.testing.assert_allclose(distances, 3, rtol=1e-5)
+
+
+@pytest.mark.parametrize("span_deg", [360, 75])
+@pytest.mark.parametrize("turns", [(1, 1, 1, 1, 1), (1, -1, -1, 1, 1)])
+def test_photographs_on_their_side_go_around_the_same_axis(span_deg, turns):
+    views = ring(even(5, span_deg), elevation_deg=20)
+    on_side = views.world_to_cam.clone()
+    for matrix, turn in zip(on_side, turns, strict=True):
+        right, down = matrix[0].clone(), matrix[1].clone()
+        matrix[0], matrix[1] = turn * down, -turn * right
+    circle = fit_orbit_of_few(Camera(on_side, views.intrinsics, views.height, views.width))
+    np.testing.assert_allclose(np.abs(circle.axis), [0, 0, 1], atol=1e-5)
