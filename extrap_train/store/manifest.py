@@ -166,9 +166,9 @@ def claim(
     """Hold a result's folder for this process alone as long as the block lasts.
 
     A link is followed. Leftovers of killed writers are removed. With `resume`, what lies there must
-    be of the same manifest (`Conflict`); without, it is to be replaced. Raises InputError if
-    another process holds the folder, or if anything lies there that does not say that it is a
-    result, which is left alone.
+    be of the same manifest (`Conflict`), unless nothing but the manifest is there; without, it is
+    to be replaced. Raises InputError if another process holds the folder, or if anything lies there
+    that does not say that it is a result, which is left alone.
     """
     place = link_target(folder)
     place.parent.mkdir(parents=True, exist_ok=True)
@@ -178,6 +178,8 @@ def claim(
         is_there = os.path.lexists(place) and not is_empty
         if is_there:
             read_manifest(folder, _LEFT_ALONE)
+            # What was begun and failed at once left nothing that could be lost.
+            is_there = [path.name for path in place.iterdir()] != [MANIFEST]
         if is_there and resume:
             require_same(folder, manifest, remedy)
         remove_leftovers(place.parent, of=place.name if folder.is_symlink() else "")

@@ -64,6 +64,7 @@ from extrap_train.tasks.scene_model import (
     UsedWeights,
     device_of,
     model_options,
+    named_weights,
     scene_generator,
     trained_model,
 )
@@ -136,6 +137,8 @@ def run(config: TrainConfig, watch: Watch | None = None) -> Outcome:
 
 def _open_job(config: TrainConfig) -> _Job:
     scene = required_scene(config)
+    if _is_generated(config):
+        named_weights(config)  # refused before cameras are estimated, which may take minutes
     options = config.data if isinstance(config.data, SyntheticConfig) else SyntheticConfig()
     sequence = open_scene(scene, options)
     truth = None

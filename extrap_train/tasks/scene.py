@@ -53,6 +53,7 @@ from extrap_train.tasks.scene_model import (
     device_of,
     generate_views,
     model_options,
+    named_weights,
     scene_generator,
     trained_model,
 )
@@ -77,6 +78,7 @@ def run(config: TrainConfig) -> Outcome:
             "trainer.compile=true: task=scene trains for minutes, of which compiling takes most: "
             "leave it out"
         )
+    named_weights(config)  # refused before cameras are estimated, which may take minutes
     sequence = open_sequence(config)
     folder, used = result_folder(config, label_of(sequence)), UsedWeights.of(config)
     read = _frames_read(config, sequence)

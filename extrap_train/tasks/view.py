@@ -46,6 +46,7 @@ from extrap_train.tasks.scene_model import (
     frames_learnt,
     generate_views,
     model_options,
+    named_weights,
     scene_generator,
     trained_model,
 )
@@ -88,6 +89,7 @@ def run(config: TrainConfig) -> None:
     They replace what was asked of the same scene, inputs and weights before.
     """
     console = terminal()
+    named_weights(config)  # refused before cameras are estimated, which may take minutes
     sequence = open_sequence(config)
     config = replace(config, pose=_as_named(config.pose, sequence))
     query = _query(config, sequence)

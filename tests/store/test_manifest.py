@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from extrap_train.store.manifest import Manifest, Split
+from extrap_train.store.manifest import MANIFEST, Conflict, Manifest, Split, claim
 from extrap_train.store.records import read_record, write_record
 
 _SPLIT = Split("synthetic", ("0002", "0003"), ("0000", "0001"), seed=0)
@@ -57,3 +57,16 @@ def test_many_differences_are_counted() -> None:
     found = other.differences(_MANIFEST)
     assert len(found) < 10
     assert "36 more" in found[-1]
+
+
+def test_a_result_that_failed_before_its_first_file_does_not_hinder_another(tmp_path: Path) -> None:
+    folder, other = tmp_path / "result", replace(_MANIFEST, options={"depth.name": "dataset"})
+    with claim(folder, _MANIFEST, resume=True) as result:
+        result.begin()
+    with claim(folder, other, resume=True) as result:
+        assert not result.is_reused
+        result.begin()
+        (folder / "cloud.ply").touch()
+    with pytest.raises(Conflict, match=r"depth\.name"), claim(folder, _MANIFEST, resume=True):
+        pass
+    assert {path.name for path in folder.iterdir()} == {MANIFEST, "cloud.ply"}
