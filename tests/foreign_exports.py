@@ -10,8 +10,9 @@ import numpy as np
 from PIL import Image
 
 WIDTH, HEIGHT = 40, 30
-POINTS = np.array([[0.0, 0.0, 0.0], [0.2, -0.1, 0.15], [-0.15, 0.1, 0.2], [0.1, 0.2, -0.1]])
+POINTS = np.array([[0.0, 0.1, 0.0], [0.5, -0.3, 0.2], [-0.5, 0.3, 0.3], [0.4, 0.4, -0.4]])
 """In the world; every `shot` shows them."""
+DOT_PIXELS = 2.0
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,22 @@ def save_picture(path, width=WIDTH, height=HEIGHT, seed=0):
     path.parent.mkdir(parents=True, exist_ok=True)
     noise = np.random.default_rng(seed).integers(0, 255, (height, width, 3), dtype=np.uint8)
     Image.fromarray(noise).save(path)
+
+
+def save_dot(path, pixel, width, height):
+    """A picture of one bright dot, centred where a camera shows a point."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    v, u = np.mgrid[:height, :width] + 0.5
+    grey = 255 * np.exp(-((u - pixel[0]) ** 2 + (v - pixel[1]) ** 2) / 2 / DOT_PIXELS**2)
+    Image.fromarray(np.repeat(grey.round().astype(np.uint8)[..., None], 3, 2)).save(path)
+
+
+def dot_of(image):
+    """Where a picture, `3 h w`, shows its dot."""
+    grey = image[0].double().numpy()
+    grey = np.where(grey > 0.1, grey, 0)
+    v, u = np.mgrid[: grey.shape[0], : grey.shape[1]] + 0.5
+    return np.array([(grey * u).sum(), (grey * v).sum()]) / grey.sum()
 
 
 def pixels_of(camera, points=POINTS):

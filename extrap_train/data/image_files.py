@@ -217,6 +217,12 @@ def image_size(path: Path, annotated: tuple[int, int] | None = None) -> tuple[in
     return turned if turn else stored
 
 
+def stored_size(path: Path) -> tuple[int, int]:
+    """(height, width) in pixels as they are stored, whatever the EXIF orientation."""
+    with _open(path) as picture:
+        return _sizes(picture, _orientation(picture))[0]
+
+
 def upright_photograph(path: Path) -> tuple[tuple[int, int], float | None]:
     """(height, width) once turned by the EXIF orientation, and the focal length that EXIF tells.
 

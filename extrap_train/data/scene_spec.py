@@ -11,7 +11,9 @@ from extrap_train.data.co3d import FRAME_ANNOTATIONS, read_sequence
 from extrap_train.data.colmap import find_model, read_model
 from extrap_train.data.estimated_poses import find_pictures, read_unposed
 from extrap_train.data.keyframes import read_video
+from extrap_train.data.metashape import find_metashape_cameras, read_metashape
 from extrap_train.data.polycam import find_keyframe_cameras, read_polycam
+from extrap_train.data.realitycapture import find_camera_table, read_realitycapture
 from extrap_train.data.record3d import find_metadata, read_record3d
 from extrap_train.data.sequences import FrameSequence
 from extrap_train.data.synthetic.capture import synthetic_sequence
@@ -24,8 +26,9 @@ UCO3D_SCHEME = "uco3d:"
 SYNTHETIC_SCHEME = "synthetic:"
 KNOWN_FORMS = (
     "co3d:ROOT/category/sequence, uco3d:ROOT/supercategory/category/sequence, a folder with a "
-    "transforms.json, a COLMAP model (sparse/0 beside images) or an export of Polycam or Record3D, "
-    "a folder of photographs, a .zip or .r3d of such a folder, a video, or synthetic:category/0003"
+    "transforms.json, a COLMAP model (sparse/0 beside images) or an export of Polycam, Record3D, "
+    "Metashape (XML) or RealityCapture (CSV), a folder of photographs, a .zip or .r3d of such a "
+    "folder, a video, or synthetic:category/0003"
 )
 
 _CAMERA_FILES = (
@@ -67,6 +70,10 @@ def _open_folder(folder: Path, spec: str) -> FrameSequence:
         return read_polycam(cameras, name)
     if metadata := find_metadata(folder):
         return read_record3d(metadata, name)
+    if cameras := find_metashape_cameras(folder):
+        return read_metashape(cameras, name)
+    if table := find_camera_table(folder):
+        return read_realitycapture(table, name)
     if file := _camera_like_file(folder):
         raise InputError(
             f"scene {spec!r}: {file} describes cameras, but not in a form that is read "

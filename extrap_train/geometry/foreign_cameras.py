@@ -4,11 +4,14 @@ PyTorch3D (CO3D)
     Multiplies row vectors from the left, `x_cam = x_world @ R + T`; its camera looks along +Z with
     +X to the *left* and +Y *up*. Focal length and principal point are in one of two NDC units; both
     have their origin in the image's centre and grow to the left and upwards.
-OpenGL (nerfstudio, Blender, ZeroNVS, ARKit)
+OpenGL (nerfstudio, Blender, ZeroNVS, ARKit, RealityCapture)
     Stores `cam_to_world`, with +X right, +Y up, −Z forward.
 COLMAP
     Stores world-to-camera as a quaternion (w, x, y, z) and a translation; its axes (OpenCV's) and
     pixel centres (+0.5) are ours already.
+Metashape
+    Stores camera-to-chunk, and a similarity from the chunk to the world; axes and pixel centres are
+    COLMAP's.
 """
 
 from dataclasses import dataclass
@@ -100,6 +103,19 @@ def opengl_from_quaternion(
 ) -> Float[Tensor, "*b 4 4"]:
     """An OpenGL camera's `cam_to_world`; the quaternion may have any length but 0, which is NaN."""
     return _rigid_transform(quaternion_xyzw, translation)
+
+
+def opengl_from_heading(
+    angles_rad: Float[Tensor, "*b 3"], position: Float[Tensor, "*b 3"]
+) -> Float[Tensor, "*b 4 4"]:
+    """An OpenGL camera's `cam_to_world` from RealityCapture's heading, pitch and roll.
+
+    The camera looks down (−Z) where all are 0: roll turns it about its +Y, then pitch about +X, and
+    heading clockwise about +Z.
+    """
+    signed = angles_rad * angles_rad.new_tensor([-1.0, 1.0, 1.0])
+    rotation = roma.euler_to_rotmat("ZXY", signed)
+    return roma.Rigid(rotation, position).to_homogeneous()
 
 
 def opengl_from_world_to_cam(world_to_cam: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
