@@ -37,7 +37,7 @@ from extrap_train.data.co3d.annotations import read_sequence_split
 from extrap_train.data.prepared import PreparedData
 from extrap_train.data.sequences import FrameSequence
 from extrap_train.jobs import Launcher
-from extrap_train.jobs.slurm import open_launcher
+from extrap_train.jobs.launchers import open_launcher
 
 LOCAL = LocalConfig()
 

@@ -37,7 +37,7 @@ GROUPS: dict[str, list[type]] = {
         schema.Mast3rMatcherConfig,
         schema.OwnMatcherConfig,
     ],
-    "launcher": [schema.LocalConfig, schema.SlurmConfig],
+    "launcher": [schema.LocalConfig, schema.SlurmConfig, schema.RayConfig],
     "model": [schema.ModelConfig],
     "logger": [schema.LoggerConfig],
 }

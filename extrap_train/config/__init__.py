@@ -21,6 +21,7 @@ from extrap_train.config.commands import (
     LauncherConfig,
     LocalConfig,
     LoggerConfig,
+    RayConfig,
     SlurmConfig,
     TrainConfig,
     TrainerConfig,

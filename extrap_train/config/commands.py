@@ -161,6 +161,24 @@ class SlurmConfig(LauncherConfig):
     )
 
 
+@dataclass
+class RayConfig(LauncherConfig):
+    """Tasks of a running Ray cluster; the command waits for them and gathers the results."""
+
+    name: str = "ray"
+    address: str = option(
+        "auto", "HOST:PORT of the cluster; auto: $RAY_ADDRESS, or the one that this machine is in"
+    )
+    at_once: int = option(
+        256, "most jobs that are handed to the cluster at a time", low=1, high=1_000_000
+    )
+    cpus: int = option(1, "cores per job", low=1, high=1024)
+    gpus: float = option(0.0, "share of a GPU per job; a job with none sees no GPU", low=0, high=1)
+    memory_gib: float = option(
+        1.0, "memory that is reserved per job", unit="GiB", low=0.1, high=4096
+    )
+
+
 TASKS = {
     "category": "prepare a category, train its model, and measure it on held-out sequences",
     "check": "draw what proves or disproves a scene's poses, scale, lens and masks",

@@ -1,4 +1,4 @@
-"""Independent jobs that leave files behind: in this process, in several, or as a SLURM job array.
+"""Independent jobs that leave files behind: here, as a SLURM array, or on Ray.
 
 A job is a function at a module's top level and an item; both are pickled. Its files are its result:
 what it returns is a small record, and a job that finds its files finished returns at once. So
@@ -41,6 +41,23 @@ class Launcher(Protocol):
         more, alone.
         """
         ...
+
+
+def run_share(
+    job: Callable[[Item], Result], items: Sequence[Item]
+) -> list[Result | Died] | BaseException:
+    """The results, or what one job raised: as an object, which a cluster's library would turn into
+    text."""
+    results: list[Result | Died] = []
+    try:
+        for item in items:
+            try:
+                results.append(job(item))
+            except MemoryError as error:
+                results.append(Died(f"out of memory ({error})"))
+    except Exception as error:
+        return error
+    return results
 
 
 def available_cores() -> int:

@@ -1,17 +1,15 @@
-"""Jobs as one SLURM job array, through submitit; and a launcher from its options."""
+"""Jobs as one SLURM job array, through submitit."""
 
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from extrap_train.config import LauncherConfig, LocalConfig, SlurmConfig
+from extrap_train.config import SlurmConfig
 from extrap_train.errors import InputError
-from extrap_train.jobs import Died, Item, Launcher, Result
-from extrap_train.jobs.local import LocalLauncher
+from extrap_train.jobs import Died, Item, Result, run_share
 
 
 class SubmittedLauncher:
@@ -61,7 +59,7 @@ class SubmittedLauncher:
             return
         parts = [[items[index] for index in share] for share in shares]
         try:
-            submitted = self._executor.map_array(_run_share, [job] * len(parts), parts)
+            submitted = self._executor.map_array(run_share, [job] * len(parts), parts)
         except (FailedJobError, FailedSubmissionError) as error:
             said = " ".join(str(error).split()) or "it said nothing"
             raise InputError(
@@ -84,22 +82,6 @@ class SubmittedLauncher:
             for task in submitted:
                 if not task.done():
                     task.cancel()
-
-
-def _run_share(
-    job: Callable[[Item], Result], items: Sequence[Item]
-) -> list[Result | Died] | BaseException:
-    """The results, or what one job raised: as an object, which submitit would turn into text."""
-    results: list[Result | Died] = []
-    try:
-        for item in items:
-            try:
-                results.append(job(item))
-            except MemoryError as error:
-                results.append(Died(f"out of memory ({error})"))
-    except Exception as error:
-        return error
-    return results
 
 
 def slurm_launcher(config: SlurmConfig, folder: Path) -> SubmittedLauncher:
@@ -137,19 +119,3 @@ def _open_slurm(config: SlurmConfig, folder: Path) -> Any:
         **{name: value for name, value in optional.items() if value is not None},
     )
     return executor
-
-
-@contextmanager
-def open_launcher(config: LauncherConfig, workers: int, folder: Path) -> Iterator[Launcher]:
-    """The launcher that the type of `config` stands for; its processes end with the context.
-
-    `workers` is the number of local processes, `folder` the place for a cluster's logs.
-    """
-    match config:
-        case LocalConfig():
-            with LocalLauncher(workers) as local:
-                yield local
-        case SlurmConfig():
-            yield slurm_launcher(config, folder)
-        case _:
-            raise InputError(f"launcher={config.name}: unknown; choose local or slurm")

@@ -17,8 +17,9 @@ import pytest
 from extrap_train.config import SlurmConfig
 from extrap_train.errors import InputError
 from extrap_train.jobs import ONE_THREAD, Died, Launcher, available_cores
+from extrap_train.jobs.launchers import open_launcher
 from extrap_train.jobs.local import LocalLauncher
-from extrap_train.jobs.slurm import SubmittedLauncher, open_launcher, slurm_launcher
+from extrap_train.jobs.slurm import SubmittedLauncher, slurm_launcher
 
 
 def test_cores_are_counted_where_the_system_binds_no_process(
