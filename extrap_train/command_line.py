@@ -19,6 +19,12 @@ from extrap_train import config as schema
 from extrap_train.config import Option, options_of
 from extrap_train.errors import InputError
 
+_NETWORK_MATCHERS: list[type] = [
+    schema.LoftrMatcherConfig,
+    schema.AlikedMatcherConfig,
+    schema.Mast3rMatcherConfig,
+    schema.OwnMatcherConfig,
+]
 GROUPS: dict[str, list[type]] = {
     "category": [schema.CategoryConfig],
     "data": [schema.SyntheticConfig, schema.Co3dConfig, schema.Uco3dConfig],
@@ -30,13 +36,8 @@ GROUPS: dict[str, list[type]] = {
         schema.FilesDepthConfig,
         schema.OwnDepthConfig,
     ],
-    "matcher": [
-        schema.FlowMatcherConfig,
-        schema.LoftrMatcherConfig,
-        schema.AlikedMatcherConfig,
-        schema.Mast3rMatcherConfig,
-        schema.OwnMatcherConfig,
-    ],
+    "matcher": [schema.FlowMatcherConfig, *_NETWORK_MATCHERS],
+    "poses": [schema.SiftPosesConfig, *_NETWORK_MATCHERS],
     "launcher": [schema.LocalConfig, schema.SlurmConfig, schema.RayConfig],
     "model": [schema.ModelConfig],
     "logger": [schema.LoggerConfig],

@@ -44,6 +44,7 @@ from extrap_train.config.data_sources import (
     OwnDepthConfig,
     OwnMatcherConfig,
     PrepConfig,
+    SiftPosesConfig,
     StereoConfig,
     SyntheticConfig,
     Uco3dConfig,

@@ -89,6 +89,7 @@ def _check_files(config: TrainConfig | DataPrepConfig) -> None:
         "depth": config.depth,
         "depth.matcher": getattr(config.depth, "matcher", None),
         "matcher": getattr(config, "matcher", None),
+        "poses": getattr(config, "poses", None),
     }
     for option, part in options.items():
         if hasattr(part, "checkpoint"):

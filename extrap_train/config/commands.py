@@ -207,6 +207,8 @@ class TrainConfig(SceneOptions):
     data: DataConfig = MISSING
     depth: DepthConfig = MISSING
     matcher: MatcherConfig = MISSING
+    poses: MatcherConfig = MISSING
+    """Whose matches place photographs that come without cameras."""
     model: ModelConfig = MISSING
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     prep: PrepConfig = field(default_factory=PrepConfig)

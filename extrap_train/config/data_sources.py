@@ -214,6 +214,14 @@ class Mast3rMatcherConfig(MatcherConfig):
 
 
 @dataclass
+class SiftPosesConfig(MatcherConfig):
+    """pycolmap's own SIFT features and matches, for `poses`."""
+
+    name: str = "sift"
+    has_network: ClassVar[bool] = False
+
+
+@dataclass
 class OwnMatcherConfig(MatcherConfig):
     """A class with the protocol of `extrap_train/matching`, named by a YAML."""
 

@@ -8,7 +8,7 @@ before anything of that size is allocated, and what cannot be used raises `Input
 | a capture by what a person typed | `scene_spec` (`archives`) |
 | its description | `co3d`, `uco3d`, `transforms_json` (`lens_keys`), `colmap`, `synthetic` |
 | another program's | `polycam`, `record3d`, `metashape`, `realitycapture` (`photogrammetry`) |
-| photographs and videos without one | `estimated_poses` (`structure_from_motion`), `keyframes` |
+| photographs and videos without one | `estimated_poses` (`picture_matches`), `keyframes` |
 | to frames not yet read | `posed_entries`, `listed_photographs`, `listed_files`, `sequences` |
 | files to pixels | `image_files`, `video_files`, `depth_files` (`lzfse_files`) |
 | whether paths, text and cameras are sound | `paths`, `json_files`, `xml_files`, `camera_check` |

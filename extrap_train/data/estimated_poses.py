@@ -1,4 +1,5 @@
-"""Photographs without cameras: cameras are estimated with pycolmap, once for each set of pictures.
+"""Photographs without cameras: cameras are estimated with pycolmap, once for each set of pictures,
+by the matches of its own SIFT or of any matcher.
 
 The world is centred on the cameras, and its unit is about the diagonal of the box around them
 (COLMAP's normalisation: the box leaves out the outer tenth on each side).
@@ -13,20 +14,23 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
 import torch
 from PIL import Image
 
+from extrap_train.config import MatcherConfig, SiftPosesConfig
 from extrap_train.data.camera_check import LONGEST_FOCAL, SHORTEST_FOCAL
 from extrap_train.data.colmap import read_model, read_model_cameras
 from extrap_train.data.image_files import read_photograph, to_eight_bits, upright_photograph
 from extrap_train.data.listed_files import PICTURE_SUFFIXES, is_mask_name
 from extrap_train.data.paths import require_file
+from extrap_train.data.picture_matches import write_matches
 from extrap_train.data.sequences import FrameSequence
 from extrap_train.data.structure_from_motion import (
+    ESTIMATE,
     MAX_FEATURES,
     MAX_SIDE,
     MIN_PICTURES,
@@ -35,7 +39,9 @@ from extrap_train.data.structure_from_motion import (
     count_steps,
     write_job,
 )
+from extrap_train.depth.sources import weight_files
 from extrap_train.errors import InputError
+from extrap_train.matching.matchers import matcher
 from extrap_train.store.cache import cache_entry, fill_entry, is_sealed, seal
 from extrap_train.store.digests import file_digest
 from extrap_train.terminal import progress
@@ -61,25 +67,32 @@ def find_pictures(folder: Path) -> list[str]:
     return [name for name in names if not is_mask_name(name, names)]
 
 
-def read_unposed(folder: Path, pictures: Sequence[str], name: str) -> FrameSequence:
+def read_unposed(
+    folder: Path, pictures: Sequence[str], name: str, poses: MatcherConfig | None = None
+) -> FrameSequence:
     """The capture of a folder's `pictures`, whose cameras are estimated and kept in the cache.
 
-    Pictures that cannot be read or placed are left out with one warning. InputError where fewer
-    than three are left, or where pycolmap is needed and missing.
+    `poses` are the options of the matcher, SIFT by default. Pictures that cannot be read or
+    placed are left out with one warning. InputError where fewer than three are left, or where
+    pycolmap or weights are needed and missing.
     """
     if len(pictures) > MAX_PICTURES:
         raise InputError(
             f"{folder}: has {len(pictures)} photographs without cameras, and those of at most "
             f"{MAX_PICTURES} are estimated; choose some, or run COLMAP yourself"
         )
-    pictures = _select_present(folder, pictures)
-    settings = {"max_side": MAX_SIDE, "max_features": MAX_FEATURES, "seed": SEED}
+    pictures, poses = _select_present(folder, pictures), poses or SiftPosesConfig()
+    settings = {
+        **{"max_side": MAX_SIDE, "max_features": MAX_FEATURES, "seed": SEED},
+        "matcher": {key: value for key, value in asdict(poses).items() if key != "checkpoint"},
+        "weights": [file_digest(file) for file in weight_files(poses) if file.is_file()],
+    }
     content = json.dumps([settings, {p: file_digest(folder / p) for p in sorted(pictures)}])
     stored = cache_entry("poses", name, hashlib.sha256(content.encode()).hexdigest())
     is_sound = partial(is_sealed, part="sparse")
     if not is_sound(stored):
         with fill_entry(stored, is_sound, "estimated cameras") as made:
-            _estimate(folder, pictures, made)
+            _estimate(folder, pictures, poses, made)
             seal(made, "sparse")
         log.warning("%s: cameras estimated from the photographs are kept in %s", folder, stored)
     sequence = read_model(stored / "sparse" / "0", folder, name, upright=True)
@@ -96,7 +109,22 @@ def read_unposed(folder: Path, pictures: Sequence[str], name: str) -> FrameSeque
             more,
         )
     reasons = tuple(f"{folder / picture}: could not be placed among the others" for picture in lost)
-    return replace(sequence, left_out=reasons, listed=tuple(pictures))
+    return replace(
+        sequence,
+        left_out=reasons,
+        listed=tuple(pictures),
+        poses=f"pycolmap with matches of {poses.name}: {_summary(stored)}",
+    )
+
+
+def _summary(stored: Path) -> str:
+    """What the estimate says of itself."""
+    said = json.loads((stored / "sparse" / "0" / ESTIMATE).read_text(encoding="utf-8"))
+    length = said["observations"] / said["points"]
+    return (
+        f"{said['points']:,} points in {length:.1f} photographs each, mean reprojection error "
+        f"{said['error_px']:.2f} px"
+    )
 
 
 def _select_present(folder: Path, pictures: Sequence[str]) -> list[str]:
@@ -115,7 +143,7 @@ def _select_present(folder: Path, pictures: Sequence[str]) -> list[str]:
     return present
 
 
-def _estimate(folder: Path, pictures: Sequence[str], made: Path) -> None:
+def _estimate(folder: Path, pictures: Sequence[str], poses: MatcherConfig, made: Path) -> None:
     """Write the model to `made/sparse/0`."""
     if importlib.util.find_spec("pycolmap") is None:
         raise InputError(
@@ -124,13 +152,17 @@ def _estimate(folder: Path, pictures: Sequence[str], made: Path) -> None:
         )
     work = made / "work"
     work.mkdir()
-    cameras = _write_grey(folder, pictures, work)
+    is_sift = isinstance(poses, SiftPosesConfig)
+    matching = None if is_sift else matcher(poses, "poses")
+    cameras = _write_small(folder, pictures, work, "pgm" if is_sift else "ppm")
     count = sum(len(camera.files) for camera in cameras)
     if count < MIN_PICTURES:
         raise InputError(
             f"{folder}: has {count} readable photographs and no cameras, which takes at least "
             f"{MIN_PICTURES} to estimate; add photographs, or a transforms.json or COLMAP model"
         )
+    if matching is not None:
+        write_matches(matching, work, sorted(file for c in cameras for file in c.files))
     write_job(cameras, work)
     _run(work, count)
     model = work / "sparse" / "0"
@@ -144,22 +176,27 @@ def _estimate(folder: Path, pictures: Sequence[str], made: Path) -> None:
     shutil.rmtree(work)
 
 
-def _write_grey(folder: Path, pictures: Sequence[str], work: Path) -> list[SharedCamera]:
-    """Upright grey pictures for features; those of one size and focal length share a camera."""
+def _write_small(
+    folder: Path, pictures: Sequence[str], work: Path, suffix: str
+) -> list[SharedCamera]:
+    """Upright pictures to match, `pgm` in grey and `ppm` in colour; those of one size and focal
+    length share a camera.
+    """
     groups: dict[tuple[tuple[int, int], float | None], SharedCamera] = {}
     with progress("reading photographs", len(pictures), "photographs") as bar:
         for number, name in enumerate(pictures):
-            file = f"{number:04d}.pgm"
+            file = f"{number:04d}.{suffix}"
             try:
                 size, focal = upright_photograph(folder / name)
                 image, _ = read_photograph(folder / name, size, upright=True)
             except InputError as error:
                 log.warning("%s", error)
                 continue
-            grey = Image.fromarray(to_eight_bits(image).transpose(1, 2, 0)).convert("L")
-            grey.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.LANCZOS)
-            grey.save(work / file)
-            group = SharedCamera([], [], *size, focal and focal * grey.width / size[1])
+            small = Image.fromarray(to_eight_bits(image).transpose(1, 2, 0))
+            small = small.convert("L") if suffix == "pgm" else small
+            small.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.LANCZOS)
+            small.save(work / file)
+            group = SharedCamera([], [], *size, focal and focal * small.width / size[1])
             camera = groups.setdefault((size, focal), group)
             camera.names.append(name)
             camera.files.append(file)

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
+from extrap_train.config import MatcherConfig
 from extrap_train.data.estimated_poses import find_pictures, read_unposed
 from extrap_train.data.sequences import FrameSequence
 from extrap_train.data.structure_from_motion import MIN_PICTURES
@@ -47,11 +48,12 @@ _JPEG_QUALITY = 95
 Grey = UInt8[np.ndarray, "h w"]
 
 
-def read_video(file: Path) -> FrameSequence:
+def read_video(file: Path, poses: MatcherConfig | None = None) -> FrameSequence:
     """The capture of a video: some of its frames, kept in the cache, with estimated cameras.
 
-    Frames are named by their number in the video. InputError where the file is no video, shows
-    fewer than three distinct views, or its cameras cannot be estimated.
+    Frames are named by their number in the video, and placed by `poses`, as photographs are.
+    InputError where the file is no video, shows fewer than three distinct views, or its cameras
+    cannot be estimated.
     """
     settings = [MAX_CHOSEN, MOVED, BLURRED, NEARBY, _SIDE]
     content = json.dumps([settings, file_digest(file)])
@@ -61,7 +63,7 @@ def read_video(file: Path) -> FrameSequence:
         with fill_entry(stored, is_sound, "frames of a video") as made:
             _write_chosen(file, made)
             seal(made, "images")
-    return read_unposed(stored / "images", find_pictures(stored / "images"), file.stem)
+    return read_unposed(stored / "images", find_pictures(stored / "images"), file.stem, poses)
 
 
 def choose_frames(frames: Iterable[Grey]) -> list[int]:

@@ -3,7 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
-from extrap_train.config import SyntheticConfig
+from extrap_train.config import MatcherConfig, SyntheticConfig
 from extrap_train.data import uco3d
 from extrap_train.data.archives import is_archive, unpack_archive
 from extrap_train.data.camera_check import CO3D_POSES, find_pose_fault
@@ -38,11 +38,14 @@ _CAMERA_FILES = (
 )
 
 
-def open_scene(spec: str, synthetic: SyntheticConfig | None = None) -> FrameSequence:
+def open_scene(
+    spec: str, synthetic: SyntheticConfig | None = None, poses: MatcherConfig | None = None
+) -> FrameSequence:
     """The capture that `spec` names; raises InputError that lists the known forms otherwise.
 
     `synthetic` says how many frames, of what size and from which seed a synthetic capture has; its
-    defaults are those of `data=synthetic`.
+    defaults are those of `data=synthetic`. `poses` says whose matches place photographs that have
+    no cameras; by default SIFT's.
     """
     if spec.startswith(SYNTHETIC_SCHEME):
         return _open_synthetic(spec, synthetic or SyntheticConfig())
@@ -52,15 +55,15 @@ def open_scene(spec: str, synthetic: SyntheticConfig | None = None) -> FrameSequ
         return _open_uco3d(spec)
     path = _expand_home(spec)
     if is_archive(path):
-        return replace(_open_folder(unpack_archive(path), spec), name=path.stem)
+        return replace(_open_folder(unpack_archive(path), spec, poses), name=path.stem)
     if path.is_file():
-        return read_video(path)
+        return read_video(path, poses)
     if path.is_dir():
-        return _open_folder(path, spec)
+        return _open_folder(path, spec, poses)
     raise InputError(f"scene {spec!r}: no such file or folder; give {KNOWN_FORMS}")
 
 
-def _open_folder(folder: Path, spec: str) -> FrameSequence:
+def _open_folder(folder: Path, spec: str, poses: MatcherConfig | None) -> FrameSequence:
     if (folder / TRANSFORMS).is_file():
         return read_transforms(folder)
     name = folder.resolve().name
@@ -82,7 +85,7 @@ def _open_folder(folder: Path, spec: str) -> FrameSequence:
         )
     for place in (folder, folder / "images"):
         if pictures := find_pictures(place):
-            return read_unposed(place, pictures, name)
+            return read_unposed(place, pictures, name, poses)
     raise InputError(f"scene {spec!r}: holds no camera file and no photographs; give {KNOWN_FORMS}")
 
 

@@ -136,3 +136,5 @@ class FrameSequence:
     """CO3D's score of its camera poses; None where the capture has none."""
     point_cloud_quality: float | None = None
     point_cloud: PointFile | None = None
+    poses: str = ""
+    """Where its cameras come from, in words."""

@@ -1,8 +1,9 @@
 """Cameras of photographs by structure from motion, in a process of its own.
 
 `python -m extrap_train.data.structure_from_motion FOLDER THREADS` reads `FOLDER/job.json` and the
-grey pictures that it names, writes a COLMAP model to `FOLDER/sparse/0` unless no three pictures
-belong together, and prints on each line how many more of `count_steps` are done. pycolmap handles
+pictures that it names, writes a COLMAP model to `FOLDER/sparse/0` unless no three pictures belong
+together, and prints on each line how many more of `count_steps` are done. Matches are read from
+`FOLDER/matches.npz` if it is there (`picture_matches`), and are SIFT's otherwise. pycolmap handles
 signals in its own way once it is imported, and may end the process: so it has one of its own.
 """
 
@@ -12,6 +13,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 if TYPE_CHECKING:
     import pycolmap
@@ -31,6 +34,10 @@ this share: few pictures hardly tell them from a turn of the cameras."""
 SEED = 0
 MIN_PICTURES = 3
 JOB = "job.json"
+MATCHES = "matches.npz"
+ESTIMATE = "estimate.json"
+"""What the model says of itself: its numbers of points and of the pixels that show them, and their
+mean distance from these, in pixels of the photographs."""
 
 
 @dataclass(frozen=True)
@@ -40,12 +47,12 @@ class SharedCamera:
     names: list[str]
     """Names of the photographs."""
     files: list[str]
-    """The grey pictures in the job's folder, smaller by up to `MAX_SIDE`."""
+    """The pictures in the job's folder, reduced to at most `MAX_SIDE`."""
     height: int
     width: int
     """Size of the photographs, in pixels, turned upright."""
     focal: float | None
-    """In pixels of the grey pictures, if the photographs tell it."""
+    """In pixels of the reduced pictures, if the photographs tell it."""
 
 
 def write_job(cameras: Sequence[SharedCamera], folder: Path) -> None:
@@ -78,9 +85,13 @@ def main() -> None:
     job = json.loads((folder / JOB).read_text(encoding="utf-8"))
     cameras = [SharedCamera(**camera) for camera in job]
     database = folder / "database.db"
-    for number, camera in enumerate(cameras, 1):
-        _find_features(database, folder, camera, number, threads)
-    _match(database, folder, sorted(file for c in cameras for file in c.files), threads)
+    files = sorted(file for camera in cameras for file in camera.files)
+    if (folder / MATCHES).is_file():
+        _import_matches(database, folder, cameras, files)
+    else:
+        for number, camera in enumerate(cameras, 1):
+            _find_features(database, folder, camera, number, threads)
+    _match(database, folder, files, threads)
     options = pycolmap.IncrementalPipelineOptions(
         num_threads=threads, random_seed=SEED, extract_colors=False, min_model_size=MIN_PICTURES
     )
@@ -90,9 +101,16 @@ def main() -> None:
     if models:
         model = _refine(max(models.values(), key=lambda found: found.num_reg_images()), threads)
         _restore_photographs(model, cameras)
+        model.update_point_3d_errors()
         model.normalize(extent=1.0)
         (output / "0").mkdir(exist_ok=True)
         model.write(output / "0")
+        estimate = {
+            "points": model.num_points3D(),
+            "observations": model.compute_num_observations(),
+            "error_px": model.compute_mean_reprojection_error(),
+        }
+        (output / "0" / ESTIMATE).write_text(json.dumps(estimate), encoding="utf-8")
 
 
 def _find_features(
@@ -103,11 +121,7 @@ def _find_features(
 
     options = pycolmap.FeatureExtractionOptions(num_threads=threads)
     options.sift.max_num_features = MAX_FEATURES
-    reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
-    if camera.focal is not None:
-        scale = MAX_SIDE / max(camera.height, camera.width, MAX_SIDE)
-        middle = f"{camera.width * scale / 2},{camera.height * scale / 2}"
-        reader.camera_params = f"{camera.focal},{middle},0"
+    reader = _reader(camera)
     block = 4 * threads
     for start in range(0, len(camera.files), block):
         files = camera.files[start : start + block]
@@ -125,17 +139,57 @@ def _find_features(
         print(len(files), flush=True)
 
 
+def _reader(camera: SharedCamera) -> "pycolmap.ImageReaderOptions":
+    import pycolmap
+
+    reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
+    if camera.focal is not None:
+        scale = MAX_SIDE / max(camera.height, camera.width, MAX_SIDE)
+        middle = f"{camera.width * scale / 2},{camera.height * scale / 2}"
+        reader.camera_params = f"{camera.focal},{middle},0"
+    return reader
+
+
+def _import_matches(
+    database: Path, folder: Path, cameras: Sequence[SharedCamera], files: Sequence[str]
+) -> None:
+    import pycolmap
+
+    pycolmap.Database.open(database).close()  # import_images expects one
+    single = pycolmap.CameraMode.SINGLE
+    for camera in cameras:
+        pycolmap.import_images(database, folder, single, camera.files, _reader(camera))
+    with (
+        np.load(folder / MATCHES, allow_pickle=False) as stored,
+        pycolmap.Database.open(database) as opened,
+    ):
+        numbers = {image.name: image.image_id for image in opened.read_all_images()}
+        for name in stored.files:
+            shown = [numbers[file] for file in name.split()]
+            if len(shown) == 1:
+                opened.write_keypoints(shown[0], stored[name].astype(np.float32))
+            else:
+                opened.write_matches(shown[0], shown[1], stored[name].astype(np.uint32))
+    print(len(files), flush=True)
+
+
 def _match(database: Path, folder: Path, files: Sequence[str], threads: int) -> None:
+    """Match and verify all pairs; those of `_import_matches` need only be verified."""
     import pycolmap
 
     options = pycolmap.FeatureMatchingOptions(num_threads=threads, guided_matching=True)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
+    is_matched = (folder / MATCHES).is_file()
     listed = folder / "pairs.txt"
     for pairs in filter(None, pairs_to_match(len(files))):
         listed.write_text("".join(f"{files[i]} {files[j]}\n" for i, j in pairs))
         pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
-        pycolmap.match_image_pairs(database, options, pairing, verification, pycolmap.Device.cpu)
+        if is_matched:
+            pycolmap.verify_matches(database, listed, verification)
+        else:
+            cpu = pycolmap.Device.cpu
+            pycolmap.match_image_pairs(database, options, pairing, verification, cpu)
         print(len(pairs), flush=True)
 
 

@@ -6,7 +6,7 @@ everywhere; a flow says where a pixel of the *first* picture went in the *second
 """
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -33,6 +33,10 @@ class Matches:
     def __len__(self) -> int:
         """How many there are."""
         return len(self.confidence)
+
+    def to(self, like: Tensor) -> "Matches":
+        """The same on the device, and of the type, of another tensor."""
+        return Matches(self.first.to(like), self.second.to(like), self.confidence.to(like))
 
     def __getitem__(self, index: Bool[Tensor, " n"] | Tensor | slice) -> "Matches":
         """Those at `index`."""
@@ -71,6 +75,19 @@ class Matcher(Protocol):
 
         `first_known` is False where `first` has a hole: no match starts there.
         """
+        ...
+
+
+@runtime_checkable
+class SeparableMatcher(Matcher, Protocol):
+    """A matcher that looks at each picture by itself first, which many pairs can share."""
+
+    def describe(self, image: Float[Tensor, "3 h w"]) -> Any:
+        """What `match_described` needs of one picture."""
+        ...
+
+    def match_described(self, first: Any, second: Any) -> Matches:
+        """Matches between two pictures that `describe` has seen."""
         ...
 
 

@@ -17,6 +17,8 @@ MAX_RATIO = 0.9
 CONSTANTS = ("dkd.hw_grid",)
 """The detector's constants: part of its state, but not of the published file."""
 
+Described = tuple[Float[Tensor, "_ 2"], Float[Tensor, "_ d"]]
+
 
 @dataclass(frozen=True)
 class AlikedMatcher:
@@ -28,7 +30,6 @@ class AlikedMatcher:
     config: AlikedMatcherConfig
     network: ALIKED = field(repr=False, compare=False)
 
-    @torch.no_grad()
     def match(
         self,
         first: Float[Tensor, "3 h w"],
@@ -36,19 +37,18 @@ class AlikedMatcher:
         first_known: Bool[Tensor, "h w"] | None = None,
     ) -> Matches:
         """Matches that are unique in both pictures; on the device of `first`."""
-        points, descriptors = self._features(first)
-        others, other_descriptors = self._features(second)
-        ratios, pairs = match_smnn(descriptors, other_descriptors, MAX_RATIO)
-        matches = Matches(
-            points[pairs[:, 0]].to(first),
-            others[pairs[:, 1]].to(first),
-            (1 - ratios[:, 0]).to(first),
-        )
+        matches = self.match_described(self.describe(first), self.describe(second)).to(first)
         return matches if first_known is None else matches[is_known_at(first_known, matches.first)]
 
-    def _features(
-        self, image: Float[Tensor, "3 h w"]
-    ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n d"]]:
+    def match_described(self, first: Described, second: Described) -> Matches:
+        """Matches between the keypoints of two pictures, on the network's device."""
+        (points, descriptors), (others, other_descriptors) = first, second
+        ratios, pairs = match_smnn(descriptors, other_descriptors, MAX_RATIO)
+        return Matches(points[pairs[:, 0]], others[pairs[:, 1]], 1 - ratios[:, 0])
+
+    @torch.no_grad()
+    def describe(self, image: Float[Tensor, "3 h w"]) -> Described:
+        """Keypoints in the picture's pixels, and their descriptors."""
         scale = min(1.0, self.config.image_size / max(image.shape[1:]))
         height, width = (max(1, round(side * scale)) for side in image.shape[1:])
         device = next(self.network.parameters()).device

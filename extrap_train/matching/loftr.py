@@ -42,10 +42,10 @@ class LoftrMatcher:
         one, two = self._working(first), self._working(second)
         found = self.network({"image0": one[None], "image1": two[None]})
         matches = Matches(
-            to_image_pixels(found["keypoints0"], one.shape, first.shape).to(first),
-            to_image_pixels(found["keypoints1"], two.shape, second.shape).to(first),
-            found["confidence"].to(first),
-        )
+            to_image_pixels(found["keypoints0"], one.shape, first.shape),
+            to_image_pixels(found["keypoints1"], two.shape, second.shape),
+            found["confidence"],
+        ).to(first)
         return matches if first_known is None else matches[is_known_at(first_known, matches.first)]
 
     def _working(self, image: Float[Tensor, "3 h w"]) -> Float[Tensor, "1 h2 w2"]:

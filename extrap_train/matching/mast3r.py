@@ -10,7 +10,7 @@ from torch import Tensor
 from extrap_train.config import Mast3rMatcherConfig
 from extrap_train.depth.mast3r.network.crop import crop_for, network_input
 from extrap_train.depth.mast3r.network.mast3r_checkpoint import read_network
-from extrap_train.depth.mast3r.network.point_map_network import PointMapNetwork
+from extrap_train.depth.mast3r.network.point_map_network import Encoding, PointMapNetwork
 from extrap_train.errors import InputError
 from extrap_train.matching import Matches, is_known_at
 from extrap_train.views import Camera, View
@@ -21,6 +21,14 @@ ROUNDS = 10
 """Most times that a start moves on before it is given up."""
 _ROWS = 512
 """Descriptors compared with all others at a time, for the sake of memory."""
+
+
+@dataclass(frozen=True)
+class Described:
+    """One picture's tokens, and the affine map from its pixels to the network's."""
+
+    encoding: Encoding
+    affine: Float[Tensor, "3 3"]
 
 
 @dataclass(frozen=True)
@@ -36,7 +44,6 @@ class Mast3rMatcher:
     network: PointMapNetwork = field(repr=False, compare=False)
     option: str = "matcher"
 
-    @torch.no_grad()
     def match(
         self,
         first: Float[Tensor, "3 h w"],
@@ -44,28 +51,35 @@ class Mast3rMatcher:
         first_known: Bool[Tensor, "h w"] | None = None,
     ) -> Matches:
         """Pixels that are each other's nearest by descriptor; on the device of `first`."""
-        (one, one_affine), (two, two_affine) = (self._prepare(image) for image in (first, second))
-        here, there = self.network.describe(self.network.encode(one), self.network.encode(two))
-        ones, twos = find_reciprocal(here.descriptors[0], there.descriptors[0])
-        sure = (here.confidence.flatten()[ones] * there.confidence.flatten()[twos]).sqrt()
-        matches = Matches(
-            _pixels(ones, one.shape[-1], one_affine).to(first),
-            _pixels(twos, two.shape[-1], two_affine).to(first),
-            (sure / (1 + sure)).to(first),
-        )
+        matches = self.match_described(self.describe(first), self.describe(second)).to(first)
         return matches if first_known is None else matches[is_known_at(first_known, matches.first)]
 
-    def _prepare(
-        self, image: Float[Tensor, "3 h w"]
-    ) -> tuple[Float[Tensor, "1 3 h2 w2"], Float[Tensor, "3 3"]]:
-        """What the network sees, and the affine map from the picture's pixels to its own."""
+    @torch.no_grad()
+    def match_described(self, first: Described, second: Described) -> Matches:
+        """Matches between two pictures, on the network's device."""
+        here, there = self.network.describe(first.encoding, second.encoding)
+        ones, twos = find_reciprocal(here.descriptors[0], there.descriptors[0])
+        sure = (here.confidence.flatten()[ones] * there.confidence.flatten()[twos]).sqrt()
+        widths = here.confidence.shape[-1], there.confidence.shape[-1]
+        return Matches(
+            _pixels(ones, widths[0], first.affine),
+            _pixels(twos, widths[1], second.affine),
+            sure / (1 + sure),
+        )
+
+    @torch.no_grad()
+    def describe(self, image: Float[Tensor, "3 h w"]) -> Described:
+        """The picture as the network's encoder sees it, cropped to the shapes that it knows."""
         height, width = image.shape[1:]
         # Intrinsics of 1 follow resampling and crop as pixels do.
-        view = View(image, Camera(torch.eye(4), torch.eye(3), height, width), name="a picture")
+        view = View(
+            image.cpu(), Camera(torch.eye(4), torch.eye(3), height, width), name="a picture"
+        )
         patch, device = self.network.architecture.patch, self.network.mask_token.device
         crop = crop_for(view, self.config.image_size, patch, square=False, option=self.option)
         small = crop.apply(view)
-        return network_input(small, device), small.camera.intrinsics.to(device)
+        encoding = self.network.encode(network_input(small, device))
+        return Described(encoding, small.camera.intrinsics.to(device))
 
 
 def find_reciprocal(

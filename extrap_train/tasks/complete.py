@@ -17,7 +17,7 @@ from extrap_train.config import (
     TrainConfig,
     dotted,
 )
-from extrap_train.data.scene_spec import SYNTHETIC_SCHEME, open_scene
+from extrap_train.data.scene_spec import SYNTHETIC_SCHEME
 from extrap_train.data.sequences import NO_CATEGORY, Frame, FrameSequence
 from extrap_train.data.square_frames import load_readable, require_few_unusable
 from extrap_train.data.synthetic import SyntheticScene, build_scene
@@ -55,6 +55,7 @@ from extrap_train.store.digests import file_digest
 from extrap_train.store.manifest import claim
 from extrap_train.tasks.completion_results import Completed, write_completed
 from extrap_train.tasks.scene_inputs import (
+    open_sequence,
     require_space,
     required_scene,
     result_folder,
@@ -140,7 +141,7 @@ def _open_job(config: TrainConfig) -> _Job:
     if _is_generated(config):
         named_weights(config)  # refused before cameras are estimated, which may take minutes
     options = config.data if isinstance(config.data, SyntheticConfig) else SyntheticConfig()
-    sequence = open_scene(scene, options)
+    sequence = open_sequence(config)
     truth = None
     if scene.startswith(SYNTHETIC_SCHEME):
         truth = build_scene(sequence.category, int(sequence.name), options.seed)

@@ -52,7 +52,7 @@ def required_scene(config: TrainConfig) -> str:
 def open_sequence(config: TrainConfig) -> FrameSequence:
     """The scene's frames, of which no photograph has been read yet."""
     synthetic = config.data if isinstance(config.data, SyntheticConfig) else None
-    return open_scene(required_scene(config), synthetic)
+    return open_scene(required_scene(config), synthetic, config.poses)
 
 
 def label_of(sequence: FrameSequence) -> str:
