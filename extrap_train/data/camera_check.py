@@ -144,15 +144,16 @@ COLMAP_POSES = PoseConvention(
 CO3D_POSES = PoseConvention("PyTorch3D's, as CO3D has them")
 
 
-def find_pose_fault(cameras: Camera, convention: PoseConvention) -> str:
+def find_pose_fault(cameras: Camera, convention: PoseConvention, all_around: bool = False) -> str:
     """What is wrong with the cameras of one capture, and the likely cause; empty where nothing is.
 
     Only the poses matter. A lone camera is never at fault, nor are cameras in several places that
     look the same way, unless their poses read as another convention show one point from many sides.
+    Cameras that see all around have no direction to be wrong: they must only stand apart.
     """
     if len(cameras.world_to_cam) < 2:
         return ""
-    mistake = _likely_mistake(cameras, convention)
+    mistake = "" if all_around else _likely_mistake(cameras, convention)
     belong = f"its poses must be {convention.name}"
     if mistake:
         belong += f", and look as if they were {mistake}"
@@ -163,6 +164,8 @@ def find_pose_fault(cameras: Camera, convention: PoseConvention) -> str:
             f"apart, {away:.1e} from the origin); {belong}; coordinates of a map need a common "
             "offset taken off"
         )
+    if all_around:
+        return ""
     share = float((_angles_to_center_rad(cameras) < LOOKS_AT_RAD).mean())
     if mistake or (share < MIN_SHARE and not _look_the_same_way(cameras, PARALLEL_RAD)):
         return (

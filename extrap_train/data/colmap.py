@@ -26,6 +26,7 @@ from extrap_train.data.listed_photographs import (
 from extrap_train.data.paths import MAX_PATH_BYTES, check_relative
 from extrap_train.data.sequences import FrameSequence, PointFile
 from extrap_train.errors import InputError
+from extrap_train.geometry.cuts import Equirectangular
 from extrap_train.geometry.foreign_cameras import (
     CAMERA_MODELS,
     NAMES_AND_COUNTS,
@@ -167,7 +168,7 @@ def _photograph(
     )
 
 
-def _lens(camera: ModelCamera, file: Path) -> Lens:
+def _lens(camera: ModelCamera, file: Path) -> Lens | Equirectangular:
     """InputError where the model cannot be undone or the entry makes no sense."""
     if camera.fault:
         raise InputError(camera.fault)
@@ -179,18 +180,17 @@ def _lens(camera: ModelCamera, file: Path) -> Lens:
             "image_undistorter first"
         )
     where = f"{file}: camera {camera.number} ({model.name})"
-    count, expected = len(camera.parameters), len(model.parameters)
-    if count != expected:
-        raise InputError(
-            f"{where} has {count} parameters, expected {expected}; export the model again"
-        )
+    if len(camera.parameters) != len(model.parameters):
+        fault = f"{len(camera.parameters)} parameters, expected {len(model.parameters)}"
+        raise InputError(f"{where} has {fault}; export the model again")
     height, width = camera.height, camera.width
-    if height <= 0 or width <= 0 or height * width > MAX_PIXELS:
+    named = dict(zip(model.parameters, camera.parameters, strict=True))
+    is_size = (named.get("h", height), named.get("w", width)) == (height, width)
+    if height <= 0 or width <= 0 or height * width > MAX_PIXELS or not is_size:
         raise InputError(
             f"{where}: its size {height} x {width} is not valid; export the model again"
         )
-    named = dict(zip(model.parameters, camera.parameters, strict=True))
-    return lens_from_parameters(named, model.fisheye)
+    return Equirectangular() if "w" in named else lens_from_parameters(named, model.fisheye)
 
 
 def read_model_cameras(file: Path) -> dict[int, ModelCamera]:
@@ -254,9 +254,8 @@ def _binary_cameras(file: Path) -> list[ModelCamera]:
             number, model, width, height = cursor.read("iiQQ")
             if model not in NAMES_AND_COUNTS:
                 raise InputError(
-                    f"{file}: camera {number} is of a model that has the number {model}, and the "
-                    f"models known here end at {max(NAMES_AND_COUNTS)}; run COLMAP's "
-                    "image_undistorter first"
+                    f"{file}: camera {number} is of the model {model}, which is unknown here; run "
+                    "COLMAP's image_undistorter first"
                 )
             name, count = NAMES_AND_COUNTS[model]
             cameras.append(ModelCamera(number, name, height, width, cursor.read(f"{count}d")))

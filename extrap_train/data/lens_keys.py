@@ -9,7 +9,8 @@ import json
 import math
 from typing import Any
 
-from extrap_train.geometry.foreign_cameras import CAMERA_MODELS, lens_from_parameters
+from extrap_train.geometry.cuts import Equirectangular
+from extrap_train.geometry.foreign_cameras import CAMERA_MODELS, PANORAMA, lens_from_parameters
 from extrap_train.geometry.lens import Lens
 
 PERSPECTIVE = "PERSPECTIVE"
@@ -21,8 +22,10 @@ RATIONAL = "FULL_OPENCV"
 REFUSED = {
     "skew": "rows and columns that are not at right angles",
     "rolling_shutter": "a camera that moves while it takes a picture",
-    "equirectangular": "an equirectangular projection",
-    "latlong": "an equirectangular projection",
+    **dict.fromkeys(
+        ("equirectangular", "latlong"),
+        f"a panorama, which is written as camera_model {PANORAMA} here",
+    ),
     "orthographic": "an orthographic projection",
     "from_mitsuba": "matrices in Mitsuba's axes",
     **dict.fromkeys(
@@ -65,7 +68,7 @@ def merge_entry(common: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]
     return {key: value for key, value in common.items() if key not in hidden} | frame
 
 
-def lens_of(entry: dict[str, Any], height: int, width: int) -> Lens:
+def lens_of(entry: dict[str, Any], height: int, width: int) -> Lens | Equirectangular:
     """The lens of a merged entry, for a picture of `height` × `width` pixels.
 
     Raises KeyError for the focal length where there is none, and ValueError or TypeError that names
@@ -76,6 +79,8 @@ def lens_of(entry: dict[str, Any], height: int, width: int) -> Lens:
             raise ValueError(
                 f"{key} means {REFUSED[key]}, which cannot be undone: convert the capture"
             )
+    if entry.get("camera_model") == PANORAMA:
+        return _panorama(entry, height, width)
     focal = _focal(entry, "x", width), _focal(entry, "y", height)
     known = [length for length in focal if length is not None]
     if not known:
@@ -84,6 +89,23 @@ def lens_of(entry: dict[str, Any], height: int, width: int) -> Lens:
     return _lens_with_distortion(
         entry, {"fx": known[0], "fy": known[-1], "cx": center[0], "cy": center[1]}
     )
+
+
+def _panorama(entry: dict[str, Any], height: int, width: int) -> Equirectangular:
+    """ValueError where a key says that the picture is not a whole one.
+
+    nerfstudio writes half the width and the height as focal lengths.
+    """
+    wanted = {"fl_x": width / 2, "fl_y": height, "cx": width / 2, "cy": height / 2}
+    for key in wanted.keys() & entry.keys():
+        if not abs(number_of(entry, key) - wanted[key]) <= 1:
+            raise ValueError(
+                f"{key} is {entry[key]!r}, and that of a panorama of this size is {wanted[key]:g}: "
+                "remove it"
+            )
+    coefficients = _coefficients(entry, fisheye=True)
+    _require_zero(coefficients, _COEFFICIENTS, f"camera_model {PANORAMA}")
+    return Equirectangular()
 
 
 def _lens_with_distortion(entry: dict[str, Any], pinhole: dict[str, float]) -> Lens:

@@ -3,6 +3,8 @@ they stand there to a sequence.
 """
 
 import logging
+import posixpath
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,11 +25,14 @@ from extrap_train.data.listed_files import (
 )
 from extrap_train.data.sequences import NO_CATEGORY, FrameSequence, Photograph, PointFile
 from extrap_train.errors import InputError
+from extrap_train.geometry.cuts import Cut, Equirectangular, cuts_of
 from extrap_train.geometry.lens import Lens
 from extrap_train.views import Camera, stack_poses
 
 MAX_FRAMES = 100_000
 """Most frames of a capture; more are not a capture of one scene."""
+MAX_UNEVEN = 0.01
+"""Deviation of a panorama's sides from 2 : 1 that is rounding, as a share of its width."""
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +44,7 @@ class ListedPhotograph:
     image_path: str
     height: int
     width: int
-    lens: Lens
+    lens: Lens | Equirectangular
     world_to_cam: Float[Tensor, "4 4"]
     depth: DepthFile | None = None
     mask_path: str | None = None
@@ -78,33 +83,27 @@ def sequence_of_photographs(
         raise InputError(f"{description}: lists more than {MAX_FRAMES:,} pictures; split it")
     pictures = _find_pictures(files, listed, description)
     names = _frame_names([_name_path(path, entries) for path, entries in pictures])
-    frames, left_out, resized = [], [*unusable], []
+    photographs: list[Photograph] = []
+    all_names, left_out, resized = [], [*unusable], []
     masks = MaskFiles(files.root, [path for path, _ in pictures])
     for (path, entries), frame_name in zip(pictures, names, strict=True):
+        all_names.append(frame_name)
         if not entries:
             continue
         try:
             annotated = _describe(path, entries, description)
             photo = _at_its_size(files.root, annotated)
-            frames.append(
-                Photograph(
-                    root=files.root,
-                    name=frame_name,
-                    camera=pinhole_camera(photo, description),
-                    image_path=photo.image_path,
-                    mask=files.root / photo.mask_path if photo.mask_path else masks.find(path),
-                    depth=photo.depth,
-                    lens=None if photo.lens.is_pinhole else photo.lens,
-                    upright=photo.upright,
-                ).frame()
-            )
+            mask = files.root / photo.mask_path if photo.mask_path else masks.find(path)
+            shown = _photographs(files.root, photo, frame_name, mask, description)
         except InputError as error:
             left_out.append(str(error))
             continue
+        photographs += shown
+        all_names[-1:] = [photograph.name for photograph in shown]
         if photo is not annotated:
             resized.append(f"{path} has {photo.height} x {photo.width} pixels (height x width)")
     masks.require_distinct()
-    if not frames:
+    if not photographs:
         raise InputError(left_out[0])
     masks.warn_of_missing()
     if left_out:
@@ -112,16 +111,84 @@ def sequence_of_photographs(
     if resized:
         say = "%s: %d pictures have another size than it says: their lenses are scaled (%s)"
         log.warning(say, description, len(resized), resized[0])
-    if fault := find_pose_fault(stack_poses([frame.camera for frame in frames]), convention):
-        raise InputError(f"{description}: {fault}")
+    _check_together(photographs, all_names, convention, description)
     return FrameSequence(
         NO_CATEGORY,
         name,
-        tuple(frames),
+        tuple(photograph.frame() for photograph in photographs),
         left_out=tuple(left_out),
-        listed=tuple(names),
+        listed=tuple(all_names),
         point_cloud=point_cloud,
     )
+
+
+def _check_together(
+    photographs: Sequence[Photograph],
+    names: Sequence[str],
+    convention: PoseConvention,
+    description: Path,
+) -> None:
+    """InputError where two frames have one name, or the cameras see nothing in common."""
+    if len(set(names)) < len(names):
+        ((twice, _),) = Counter(names).most_common(1)
+        raise InputError(f"{description}: two frames are called {twice}; rename a picture")
+    # Of cuts, the one straight ahead stands where its picture's camera does.
+    poses = stack_poses([p.camera for p in photographs if not (p.cut and p.cut.yaw_deg)])
+    is_panorama = any(p.cut and isinstance(p.cut.source, Equirectangular) for p in photographs)
+    if fault := find_pose_fault(poses, convention, all_around=is_panorama):
+        raise InputError(f"{description}: {fault}")
+
+
+def _photographs(
+    root: Path, photo: ListedPhotograph, name: str, mask: Path | None, description: Path
+) -> list[Photograph]:
+    """The frame that a picture is, or the cuts of one that sees too much for that: those of
+    `1.jpg` are called `1@000.jpg`, `1@060.jpg` …
+    """
+    lens = photo.lens
+    if isinstance(lens, Lens):
+        _require_sound_lens(photo, lens, description)
+    else:
+        _require_sound_panorama(photo, f"{description}: {photo.image_path}")
+    # Depth along a fisheye's axis is none along that of a cut.
+    cuts = () if photo.depth else cuts_of(lens, photo.height, photo.width)
+    whole = Photograph(
+        root=root,
+        name=name,
+        camera=_cut_camera(photo, cuts[0]) if cuts else pinhole_camera(photo, description),
+        image_path=photo.image_path,
+        mask=mask,
+        depth=photo.depth,
+        lens=lens if isinstance(lens, Lens) and not cuts and not lens.is_pinhole else None,
+        upright=photo.upright,
+    )
+    if not cuts:
+        return [whole]
+    require_sound(whole.camera, photo.image_path, description)
+    stem, suffix = posixpath.splitext(name)
+    return [
+        replace(
+            whole, name=f"{stem}@{cut.yaw_deg:03d}{suffix}", camera=_cut_camera(photo, cut), cut=cut
+        )
+        for cut in cuts
+    ]
+
+
+def _require_sound_panorama(photo: ListedPhotograph, where: str) -> None:
+    if abs(photo.width - 2 * photo.height) > MAX_UNEVEN * photo.width:
+        raise InputError(
+            f"{where} is a panorama of {photo.width} x {photo.height} pixels, not twice as wide as "
+            "high; pad it to 360 by 180 degrees"
+        )
+    if photo.depth:
+        raise InputError(f"{where} is a panorama, whose depth cannot be read; remove its depth")
+
+
+def _cut_camera(photo: ListedPhotograph, cut: Cut) -> Camera:
+    cut_from_picture = torch.eye(4, dtype=torch.float64)
+    cut_from_picture[:3, :3] = torch.from_numpy(cut.cut_from_picture)
+    world_to_cut = cut_from_picture @ photo.world_to_cam.double()
+    return Camera(world_to_cut.float(), torch.from_numpy(cut.matrix).float(), cut.side, cut.side)
 
 
 def _find_pictures(
@@ -194,18 +261,22 @@ def _at_its_size(root: Path, photo: ListedPhotograph) -> ListedPhotograph:
         return photo
     if (height, width) == size or not same_view((height, width), size):
         return photo
-    lens = photo.lens.resized(width / photo.width, height / photo.height)
+    lens = photo.lens
+    if isinstance(lens, Lens):
+        lens = lens.resized(width / photo.width, height / photo.height)
     return replace(photo, height=height, width=width, lens=lens)
 
 
 def pinhole_camera(photo: ListedPhotograph, description: Path) -> Camera:
     """The camera of a photograph once its lens is undone; InputError where it cannot be used."""
     lens = photo.lens
-    if not all(np.isfinite([*lens.matrix.flat, *lens.distortion, lens.radial_r8])):
-        raise InputError(f"{description}: the lens of {photo.image_path} is not finite; correct it")
-    straight = _camera(photo, replace(lens, distortion=(), fisheye=False, radial_r8=0.0))
+    if not isinstance(lens, Lens):
+        raise InputError(
+            f"{description}: {photo.image_path} is a panorama, and here only a perspective camera "
+            "can be used; give its lens"
+        )
     # First, or the distortion would be blamed for a focal length of 0.
-    require_sound(straight, photo.image_path, description)
+    _require_sound_lens(photo, lens, description)
     try:
         pinhole = lens.pinhole(photo.height, photo.width)
     except ValueError as error:
@@ -213,6 +284,13 @@ def pinhole_camera(photo: ListedPhotograph, description: Path) -> Camera:
             f"{description}: {photo.image_path}: {error}; correct the lens or undistort beforehand"
         ) from None
     return _camera(photo, pinhole)
+
+
+def _require_sound_lens(photo: ListedPhotograph, lens: Lens, description: Path) -> None:
+    if not all(np.isfinite([*lens.matrix.flat, *lens.distortion, lens.radial_r8])):
+        raise InputError(f"{description}: the lens of {photo.image_path} is not finite; correct it")
+    straight = _camera(photo, replace(lens, distortion=(), fisheye=False, radial_r8=0.0))
+    require_sound(straight, photo.image_path, description)
 
 
 def _camera(photo: ListedPhotograph, pinhole: Lens) -> Camera:

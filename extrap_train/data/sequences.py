@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 from extrap_train.data.depth_files import DepthFile
 from extrap_train.data.image_files import read_photograph
 from extrap_train.data.paths import require_file
+from extrap_train.geometry.cuts import Cut
 from extrap_train.geometry.lens import Lens, undistort
 from extrap_train.views import Camera, View, WholePhotograph
 
@@ -56,19 +57,21 @@ class Photograph:
     root: Path
     name: str
     camera: Camera
-    """Camera of the undistorted photograph."""
+    """Camera of the undistorted photograph, or of the cut."""
     image_path: str
     mask: Path | None = None
     """As it is opened, the root included."""
     depth: DepthFile | None = None
     lens: Lens | None = None
     """To be undone; None for a pinhole camera's photograph."""
+    cut: Cut | None = None
+    """What of the photograph is the frame, if not the whole; then `lens` is None."""
     upright: bool = False
     """Whether the camera holds the photograph as its EXIF orientation turns it."""
 
     def frame(self) -> Frame:
         """The photograph as a frame that has not been read yet."""
-        parts = [str(self.lens)] if self.lens else []
+        parts = [str(part) for part in (self.lens, self.cut) if part]
         parts.append(f"depth in {self.depth.scale if self.depth else None}")
         parts += ["upright"] if self.upright else []
         depth = (self.depth.path, self.depth.mask_path) if self.depth else ()
@@ -81,12 +84,22 @@ class Photograph:
             load=self.load,
             files=(*files, *(self.root / file for file in depth if file)),
             reading=", ".join(parts),
-            path=self.image_path,
+            path=self._path,
+        )
+
+    @property
+    def _path(self) -> str:
+        """Of the frame: a cut is named as if it were a file beside its picture."""
+        return (
+            str(PurePosixPath(self.image_path).with_name(self.name))
+            if self.cut
+            else self.image_path
         )
 
     def load(self, *, depth: bool = True) -> View:
         """See `Load`."""
-        size = self.camera.height, self.camera.width
+        whole = self.cut or self.camera
+        size = whole.height, whole.width
         image, mask = read_photograph(self.root / self.image_path, size, self.mask, self.upright)
         found = self.depth.read(self.root, size) if depth and self.depth else None
         return View(
@@ -95,10 +108,12 @@ class Photograph:
             depth=None if found is None else self._straighten(found, nearest=True),
             mask=None if mask is None else self._straighten(mask),
             name=self.name,
-            photograph=WholePhotograph(self.image_path, self.camera),
+            photograph=WholePhotograph(self._path, self.camera),
         )
 
     def _straighten(self, picture: Tensor, nearest: bool = False) -> Tensor:
+        if self.cut is not None:
+            return torch.from_numpy(self.cut.extract(picture.numpy(), nearest))
         if self.lens is None:
             return picture
         pinhole = self.lens.pinhole(self.camera.height, self.camera.width)

@@ -144,6 +144,8 @@ class CameraModel:
     fisheye: bool = False
 
 
+PANORAMA = "EQUIRECTANGULAR"
+
 CAMERA_MODELS = (
     CameraModel(0, "SIMPLE_PINHOLE", ("f", "cx", "cy")),
     CameraModel(1, "PINHOLE", ("fx", "fy", "cx", "cy")),
@@ -158,6 +160,7 @@ CAMERA_MODELS = (
     CameraModel(9, "RADIAL_FISHEYE", ("f", "cx", "cy", "k1", "k2"), True),
     CameraModel(14, "SIMPLE_FISHEYE", ("f", "cx", "cy"), True),
     CameraModel(15, "FISHEYE", ("fx", "fy", "cx", "cy"), True),
+    CameraModel(17, PANORAMA, ("w", "h")),
 )
 
 NAMES_AND_COUNTS = {
@@ -169,7 +172,6 @@ NAMES_AND_COUNTS = {
     12: ("SIMPLE_DIVISION", 4),
     13: ("DIVISION", 5),
     16: ("EUCM", 6),
-    17: ("EQUIRECTANGULAR", 2),
 }
 """Name and number of parameters of every model of COLMAP's; those not in `CAMERA_MODELS` cannot be
 undone."""

@@ -144,7 +144,7 @@ def binary(tmp_path, camera_number=7, model_number=PINHOLE, name=b"a.png", count
         ({"count": 2**63}, "cameras.bin: is truncated or damaged"),
         ({"points": 2**62}, "images.bin: is truncated or damaged"),
         ({"camera_number": 8}, "a.png names camera 7, which the model does not have"),
-        ({"model_number": 99}, "has the number 99"),
+        ({"model_number": 99}, "of the model 99"),
         ({"name": b"../a.png"}, "climbs out of its folder"),
         ({"name": b"/a.png"}, "climbs out of its folder"),
         ({"name": b"\xff"}, "is not plain text"),
@@ -219,7 +219,7 @@ def test_a_binary_camera_that_no_picture_uses_does_not_matter(tmp_path):
 
 @pytest.mark.parametrize(
     ("model", "name"),
-    [(7, "FOV"), (10, "THIN_PRISM_FISHEYE"), (12, "SIMPLE_DIVISION"), (17, "EQUIRECTANGULAR")],
+    [(7, "FOV"), (10, "THIN_PRISM_FISHEYE"), (12, "SIMPLE_DIVISION"), (16, "EUCM")],
 )
 def test_models_that_cannot_be_undone_are_named(tmp_path, model, name):
     binary(tmp_path)

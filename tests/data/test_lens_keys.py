@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from extrap_train.data.lens_keys import REFUSED, lens_of, merge_entry
+from extrap_train.geometry.cuts import Equirectangular
 from extrap_train.geometry.lens import Lens, distort
 
 HEIGHT, WIDTH = 96, 128
@@ -88,7 +89,8 @@ def test_four_coefficients_are_those_of_a_fisheye_or_have_no_more_than_two_terms
 @pytest.mark.parametrize(
     ("keys", "named"),
     [
-        ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "fl_x|fl_y|cx|cy"),
+        ({"camera_model": "EQUIRECTANGULAR", "fl_x": 64, "fl_y": 96, "cx": 64, "cy": 40}, "cy"),
         ({"camera_model": "FISHEYE624"}, "FISHEYE624"),
         ({"camera_model": ["OPENCV"]}, "camera_model"),
         ({"camera_model": "OPENCV", "is_fisheye": True}, "is_fisheye"),
@@ -115,6 +117,13 @@ def test_four_coefficients_are_those_of_a_fisheye_or_have_no_more_than_two_terms
 def test_what_cannot_be_undone_is_named(keys, named):
     with pytest.raises(ValueError, match=named):
         lens(**(PINHOLE | keys))
+
+
+def test_a_panorama_as_nerfstudio_writes_it():
+    said = {"fl_x": WIDTH / 2, "fl_y": HEIGHT, "cx": WIDTH / 2, "cy": HEIGHT / 2, "k1": 0}
+    assert lens(camera_model="EQUIRECTANGULAR", **said) == Equirectangular()
+    with pytest.raises(ValueError, match="k1"):
+        lens(camera_model="EQUIRECTANGULAR", **(said | {"k1": 0.1}))
 
 
 @pytest.mark.parametrize("angle", [{"camera_angle_x": 45}, {"x_fov": 200}, {"camera_angle_y": 0}])

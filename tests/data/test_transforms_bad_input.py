@@ -114,7 +114,7 @@ def test_poses_of_another_convention_are_named(folder):
         ({"fl_x": "wide"}, "is malformed"),
         ({"fl_x": 10**400}, "is malformed"),
         ({"transform_matrix": [[10**400] * 4] * 4}, "is malformed"),
-        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model 'EQUIRECTANGULAR' is none of"),
+        ({"camera_model": "FISHEYE624"}, "camera_model 'FISHEYE624' is none of"),
         ({"k1": 1e6}, "cannot be undone"),
         ({"w": 60}, "is 32 x 40 pixels"),
         ({"w": -1}, "image size 32 x -1"),
