@@ -53,8 +53,9 @@ def read_metashape(file: Path, name: str) -> FrameSequence:
         if camera.get("component_id") != largest:
             unusable.append(f"{file}: {label} is in a smaller component; merge the components")
             continue
-        opengl = flip_up_and_forward(torch.from_numpy(chunk_to_world @ cam_to_chunk)).numpy()
+        cam_to_world = torch.from_numpy(chunk_to_world) @ torch.from_numpy(cam_to_chunk)
         sensor = sensors.get(camera.get("sensor_id"))
+        opengl = flip_up_and_forward(cam_to_world).numpy()
         pictures.append(PosedPicture(label, opengl, partial(_lens, sensor)))
     return sequence_of_pictures(file, name, pictures, unusable)
 

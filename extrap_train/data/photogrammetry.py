@@ -89,9 +89,10 @@ def _map_offset(positions: Float[np.ndarray, "n 3"], file: Path) -> Float[np.nda
     finite = positions[np.isfinite(positions).all(1)]
     if not len(finite):
         return np.zeros(3)
-    middle = finite.mean(0)
-    extent = np.linalg.norm(finite - middle, axis=1).max()
-    if np.linalg.norm(middle) <= _MAX_AWAY * extent or not extent:
+    with np.errstate(over="ignore", invalid="ignore"):  # of positions that no scene has
+        middle = finite.mean(0)
+        away, extent = np.linalg.norm(middle), np.linalg.norm(finite - middle, axis=1).max()
+    if not np.inf > away > _MAX_AWAY * extent > 0:
         return np.zeros(3)
     log.warning(
         "%s: its cameras stand far from the origin, as on a map, so their middle (%s) becomes the "

@@ -20,15 +20,15 @@ from extrap_train.errors import InputError
 from extrap_train.geometry.foreign_cameras import opengl_from_heading
 
 _POSITION, _ANGLES = ("x", "y", "alt"), ("heading", "pitch", "roll")
-_REQUIRED = {"name", *_POSITION, *_ANGLES, "f"}
+_REQUIRED = (*_POSITION, *_ANGLES, "f")
 _DISTORTION = {"k1": "k1", "k2": "k2", "k3": "k3", "k4": "k4", "t1": "p1", "t2": "p2"}
 _FILM_MM = 36.0
 _MAX_BYTES = 64 * 2**20
 
 
 def find_camera_table(folder: Path) -> Path | None:
-    """The CSV file of camera parameters, None where there is none; InputError for several."""
-    return find_description(folder, ".csv", lambda head: _is_table(head.decode("utf-8", "replace")))
+    """The CSV file of cameras, None where there is none; InputError for several."""
+    return find_description(folder, ".csv", _is_table)
 
 
 def read_realitycapture(table: Path, name: str) -> FrameSequence:
@@ -40,6 +40,10 @@ def read_realitycapture(table: Path, name: str) -> FrameSequence:
         raise InputError(f"{table}: has more than {_MAX_BYTES >> 20} MiB; export fewer cameras")
     lines = _lines(table.read_text("utf-8-sig", errors="replace"))
     columns, pictures, unusable = _columns(lines[0]), [], []
+    if missing := [column for column in _REQUIRED if column not in columns]:
+        raise InputError(
+            f"{table}: has no {', '.join(missing)}; export `Internal/External camera parameters`"
+        )
     try:
         rows = [row for row in csv.reader(lines[1:]) if row]
     except csv.Error as error:
@@ -71,10 +75,9 @@ def _lens(said: dict[str, str], picture: Path) -> dict[str, Any]:
     return {"w": width, "h": height, "fl_x": focal, "fl_y": focal} | center | distortion
 
 
-def _is_table(text: str) -> bool:
-    lines = _lines(text)
-    columns = _columns(lines[0]) if lines else []
-    return set(columns) >= _REQUIRED and len(set(columns)) == len(columns)
+def _is_table(head: bytes) -> bool:
+    lines = _lines(head.decode("utf-8", "replace"))
+    return bool(lines) and lines[0].startswith("#name,")
 
 
 def _lines(text: str) -> list[str]:

@@ -34,7 +34,7 @@ KNOWN_FORMS = (
 _CAMERA_FILES = (
     TRANSFORMS,
     *(f"{name}.{kind}" for name in ("cameras", "images") for kind in ("bin", "txt")),
-    "poses_bounds.npy",
+    *("poses_bounds.npy", "cameras.xml", "cameras.csv"),
 )
 
 

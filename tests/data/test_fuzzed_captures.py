@@ -8,17 +8,25 @@ import copy
 import gzip
 import json
 import random
+import re
 import resource
 import signal
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 from captures import view_at, write_capture
+from foreign_exports import save_picture
 from posed_folders import write_transforms
 from test_colmap_model import Entry, write_binary, write_text
+from test_metashape import DISTORTION, LENS, transform
+from test_metashape import write as write_metashape
+from test_polycam import SHOTS, write_camera
+from test_realitycapture import write as write_realitycapture
+from test_record3d import write_metadata
 
 from extrap_train.data.co3d import read_category
 from extrap_train.data.co3d.annotations import read_sequence_split
@@ -29,7 +37,7 @@ from extrap_train.errors import InputError
 pytestmark = pytest.mark.slow
 
 CASES = 130
-"""Cases of each of the seven kinds."""
+"""Cases of each kind."""
 SECONDS, BYTES = 20, 4 * 2**30
 RUNS_SOMETHING = ("subprocess.", "os.system", "os.exec", "os.posix_spawn", "os.fork", "pickle.")
 
@@ -257,4 +265,41 @@ def test_colmap_models(tmp_path: Path, write: Callable[[Path, list[Entry]], None
         file.write_bytes(content)
         outcomes.add(check(read, (case, file.name, content[:300])))
         file.write_bytes(whole[file])
+    assert outcomes == {True, False}
+
+
+def test_polycam(tmp_path: Path) -> None:
+    write_camera(tmp_path / "keyframes" / "cameras", "1", SHOTS[0])
+    save_picture(tmp_path / "keyframes" / "images" / "1.jpg")
+    file = tmp_path / "keyframes" / "cameras" / "1.json"
+    whole = json.loads(file.read_text())
+    check_damaged_json(file, lambda: load_all(open_scene(str(tmp_path)).frames), whole)
+
+
+def test_record3d(tmp_path: Path) -> None:
+    for index in range(3):
+        save_picture(tmp_path / "rgbd" / f"{index}.jpg")
+    write_metadata(tmp_path)
+    file = tmp_path / "metadata"
+    whole = json.loads(file.read_text())
+    check_damaged_json(file, lambda: load_all(open_scene(str(tmp_path)).frames), whole)
+
+
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [
+        ("cameras.xml", partial(write_metashape, lens=LENS | DISTORTION, of_chunk=transform())),
+        ("cameras.csv", write_realitycapture),
+    ],
+)
+def test_photogrammetry(tmp_path: Path, name: str, write: Callable[[Path], str]) -> None:
+    folder, rng, outcomes = write(tmp_path), random.Random(name), set()
+    whole = (tmp_path / name).read_text()
+    numbers = list(re.finditer(r"-?\d[\d.e-]*", whole))
+    for case in range(CASES):
+        one = rng.choice(numbers)
+        changed = whole[: one.start()] + rng.choice(TOKENS) + whole[one.end() :]
+        content = changed.encode() if case % 2 else damage_bytes(whole.encode(), rng)
+        (tmp_path / name).write_bytes(content)
+        outcomes.add(check(lambda: load_all(open_scene(folder).frames), (case, content[:300])))
     assert outcomes == {True, False}

@@ -137,11 +137,12 @@ def test_a_row_that_cannot_be_used_is_left_out(tmp_path, caplog, changes):
         ",".join(COLUMNS),
         ",".join(COLUMNS) + "\n1,2,3",
         ",".join(COLUMNS) + '\na.png,"' + "x" * 200_000,
-        "#name,name,x,y,alt,heading,pitch,roll,f\na.png",
+        "#name,x,x,y,alt,heading,pitch,roll,f\na.png",
         "#name,x,y,alt\na.png,1,2,3",
     ],
     ids=lambda text: text[:70],
 )
 def test_tables_that_describe_no_cameras(tmp_path, text):
     (tmp_path / "cameras.csv").write_text(text)
-    complaint_of(open_scene, str(tmp_path))
+    save_dot(tmp_path / "a.png", (0, 0), WIDTH, HEIGHT)
+    assert "cameras.csv" in complaint_of(open_scene, str(tmp_path))
