@@ -53,19 +53,44 @@ _SPELLINGS = (
     (("camera_model",), ("is_fisheye",)),
     (("depth_file_path",), ("depth_path",)),
 )
+_PLACE_KEYS = {key for group in _SPELLINGS[:2] for keys in group for key in keys} | {"cx", "cy"}
+"""Focal lengths and principal point."""
 LENS_KEYS = frozenset(REFUSED) | {key for group in _SPELLINGS[:4] for keys in group for key in keys}
-LENS_KEYS |= {"cx", "cy"}
+LENS_KEYS |= _PLACE_KEYS
 """Every key that is looked at here."""
 
 
 def merge_entry(common: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
-    """The keys of all frames, overridden by a frame's own, whichever way they are spelt."""
-    hidden: set[str] = set()
+    """The keys of all frames, overridden by a frame's own, whichever way they are spelt.
+
+    Distortion that stands beside a `camera_model` for all is not that of a frame with another one,
+    and a panorama shares no key of the lens with other pictures.
+    """
+    hidden = _keys_of_other_lens(common, frame)
     for spellings in _SPELLINGS:
         said = [keys for keys in spellings if any(key in frame for key in keys)]
         if said:
             hidden.update(key for keys in spellings if keys not in said for key in keys)
     return {key: value for key, value in common.items() if key not in hidden} | frame
+
+
+def _keys_of_other_lens(common: dict[str, Any], frame: dict[str, Any]) -> set[str]:
+    """Those of all frames that say nothing of one whose lens is named to be another."""
+    own, shared = frame.get("camera_model"), common.get("camera_model")
+    names_model = own is not None and shared is not None and own != shared
+    fisheyes = [_says_fisheye(entry) for entry in (common, frame)]
+    if not names_model and (None in fisheyes or fisheyes[0] == fisheyes[1]):
+        return set()
+    hidden = {*_COEFFICIENTS, "distortion_params"}
+    return hidden | _PLACE_KEYS if PANORAMA in (own, shared) else hidden
+
+
+def _says_fisheye(entry: dict[str, Any]) -> bool | None:
+    """Whether an entry says that its lens is a fisheye, or that it is none; None if neither."""
+    model, said = entry.get("camera_model"), entry.get("is_fisheye")
+    if isinstance(model, str):
+        return MODELS.get(model)
+    return said if isinstance(said, bool) else None
 
 
 def lens_of(entry: dict[str, Any], height: int, width: int) -> Lens | Equirectangular:
