@@ -51,7 +51,7 @@ def read_metashape(file: Path, name: str) -> FrameSequence:
     for camera, cam_to_chunk in cameras:
         label = camera.get("label", "")
         if camera.get("component_id") != largest:
-            unusable.append(f"{file}: {label} is in a smaller component; merge the components")
+            unusable.append(f"{file}: {label[:60]!a} is in a smaller component; merge them")
             continue
         cam_to_world = torch.from_numpy(chunk_to_world) @ torch.from_numpy(cam_to_chunk)
         sensor = sensors.get(camera.get("sensor_id"))
@@ -67,7 +67,8 @@ def _aligned_cameras(
     cameras = chunk.find("cameras")
     aligned, unusable = [], []
     for camera in () if cameras is None else cameras.iter("camera"):
-        where, transform = f"{file}: {camera.get('label', '')}", camera.find("transform")
+        where = f"{file}: {camera.get('label', '')[:60]!a}"
+        transform = camera.find("transform")
         if transform is None:
             unusable.append(f"{where} is not aligned; align it or remove it from the chunk")
         elif camera.get("enabled", "true") in ("false", "0"):

@@ -44,7 +44,8 @@ class PosedPicture:
 
 def find_description(folder: Path, suffix: str, fits: Callable[[bytes], bool]) -> Path | None:
     """The file of a folder whose beginning `fits`; InputError where several do."""
-    found = [file for file in sorted(folder.glob(f"*{suffix}")) if fits(_head(file))]
+    files = (file for file in sorted(folder.glob(f"*{suffix}")) if file.is_file())
+    found = [file for file in files if fits(_head(file))]
     if len(found) > 1:
         raise InputError(
             f"{folder}: both {found[0].name} and {found[1].name} describe cameras; keep one of them"

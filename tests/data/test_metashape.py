@@ -157,6 +157,7 @@ def test_a_fisheye_lens(tmp_path):
     "entry",
     [
         '<camera id="3" sensor_id="0" label="IMG_3"/>',
+        '<camera id="3" sensor_id="0" label="IMG_3&#10;x"/>',
         camera(3, SHOTS[3], attributes='enabled="false"'),
         camera(3, SHOTS[3], matrix=[1] * 15),
         camera(3, SHOTS[3], matrix=["nan"] * 16),
@@ -164,13 +165,14 @@ def test_a_fisheye_lens(tmp_path):
         camera(3, SHOTS[3]).replace('component_id="0"', 'component_id="1"'),
         camera(3, SHOTS[3]).replace('sensor_id="0"', 'sensor_id="7"'),
     ],
-    ids=["not aligned", "disabled", "short", "nan", "text", "component", "sensor"],
+    ids=["not aligned", "lines", "disabled", "short", "nan", "text", "component", "sensor"],
 )
 def test_a_camera_that_cannot_be_used_is_left_out_by_name(tmp_path, caplog, entry):
     cameras = "".join(camera(i, SHOTS[i]) for i in range(3)) + entry
     with caplog.at_level(logging.WARNING):
         assert len(open_scene(write(tmp_path, cameras=cameras)).frames) == 3
     assert "IMG_3" in caplog.text
+    assert all(message.isprintable() for message in caplog.messages)
 
 
 @pytest.mark.parametrize("label", ["../IMG_1", "", "bell&#7;", "no such picture"])
