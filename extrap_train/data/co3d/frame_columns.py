@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Shaped
 
-from extrap_train.data.camera_check import degenerate_camera, fits_photograph
+from extrap_train.data.camera_check import degenerate_camera, is_degenerate
 from extrap_train.data.co3d.annotations import VIEWPOINT, FrameAnnotation
 from extrap_train.data.depth_files import DepthFile
 from extrap_train.data.paths import file_stamp
@@ -159,7 +159,7 @@ def _convert_cameras(
         batch = _convert_batch([annotations[i] for i in members], height, width, ndc)
         world_to_cam[members] = batch.world_to_cam.numpy()
         intrinsics[members] = batch.intrinsics.numpy()
-        sound[members] = fits_photograph(batch).numpy()
+        sound[members] = ~is_degenerate(batch).numpy()
     return {"world_to_cam": world_to_cam, "intrinsics": intrinsics}, sound
 
 
