@@ -15,9 +15,11 @@ from torch import Tensor
 
 from extrap_train.errors import InputError
 from extrap_train.geometry.foreign_cameras import (
+    colmap_from_world_to_cam,
     flip_up_and_forward,
     opengl_from_world_to_cam,
     rigid_inverse,
+    world_to_cam_from_colmap,
 )
 from extrap_train.geometry.viewpoints import (
     LOOKS_AT_RAD,
@@ -98,18 +100,34 @@ def _lens_fault(camera: Camera) -> str:
     )
 
 
-def degenerate_camera(name: str, file: Path) -> str:
+_DEGENERATE = "NaN, no rotation, or a focal length or centre that fits no picture of its size"
+
+
+def degenerate_camera(name: str, file: Path, why: str = _DEGENERATE) -> str:
     """What to say of one that was read from `file`."""
-    return (
-        f"{file}: the camera of {name} is degenerate (NaN, no rotation, or a focal length or "
-        "centre that fits no picture of its size); correct or remove its entry"
-    )
+    return f"{file}: the camera of {name} is degenerate ({why}); correct or remove its entry"
+
+
+def _degeneracy(camera: Camera) -> str:
+    """Why a degenerate camera is one; it is not batched."""
+    rotation = camera.world_to_cam[:3, :3].double()
+    off = float((rotation @ rotation.mT - torch.eye(3).double()).abs().max())
+    if not (camera.world_to_cam.isfinite().all() and camera.intrinsics.isfinite().all()):
+        return "NaN or infinite"
+    if off >= ROTATION_TOLERANCE:
+        return (
+            f"its axes are no rotation, R Rᵀ being off by {off:.2g}: are they rounded, or scaled "
+            "unevenly?"
+        )
+    if torch.linalg.det(rotation) < 0:
+        return "its axes are mirrored, left-handed: was one axis of the world flipped?"
+    return "a focal length or centre that fits no picture of its size"
 
 
 def require_sound(camera: Camera, name: str, file: Path) -> None:
     """Raise InputError where the camera of a photograph, read from `file`, cannot be used."""
     if is_degenerate(camera):
-        raise InputError(degenerate_camera(name, file))
+        raise InputError(degenerate_camera(name, file, _degeneracy(camera)))
     if not fits_photograph(camera):
         raise InputError(f"{file}: {name}: {_lens_fault(camera)}")
 
@@ -126,6 +144,20 @@ class PoseConvention:
     """What they may be instead, each with what makes the `world_to_cam` that was read right."""
 
 
+def _quaternions_rolled(read: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 4 4"]:
+    """Poses whose quaternions w, x, y, z were read are x, y, z, w."""
+    wxyz, translation = colmap_from_world_to_cam(read)
+    return world_to_cam_from_colmap(wxyz.roll(1, dims=-1), translation)
+
+
+def _transposed_in_file(read: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 4 4"]:
+    """Poses of which PyTorch3D's R was read is its transpose."""
+    right = read.clone()
+    flip = read.new_tensor([-1.0, -1.0, 1.0])
+    right[:, :3, :3] = flip[:, None] * read[:, :3, :3].mT * flip
+    return right
+
+
 OPENGL_POSES = PoseConvention(
     "camera-to-world in OpenGL's axes (+X right, +Y up, −Z forward)",
     {
@@ -139,9 +171,16 @@ OPENGL_POSES = PoseConvention(
     },
 )
 COLMAP_POSES = PoseConvention(
-    "world-to-camera, as COLMAP writes them", {"camera-to-world": rigid_inverse}
+    "world-to-camera, as COLMAP writes them",
+    {
+        "camera-to-world": rigid_inverse,
+        "quaternions in the order x, y, z, w": _quaternions_rolled,
+    },
 )
-CO3D_POSES = PoseConvention("PyTorch3D's, as CO3D has them")
+CO3D_POSES = PoseConvention(
+    "PyTorch3D's, as CO3D has them",
+    {"PyTorch3D's with R transposed, for column vectors": _transposed_in_file},
+)
 
 
 def find_pose_fault(cameras: Camera, convention: PoseConvention, all_around: bool = False) -> str:

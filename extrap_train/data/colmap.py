@@ -72,17 +72,18 @@ class ModelImage:
 
 
 def find_model(folder: Path) -> Path | None:
-    """The folder with the model files: `folder` itself, the largest in its `sparse`, or `sparse`.
+    """The folder of the model: `folder`, the largest in its `sparse`, `sparse`, or one in `colmap`.
 
     COLMAP's mapper leaves one model for each part of the photographs that it could connect. Those
     that are not taken are named in a warning.
     """
     if _images_file(folder):
         return folder
-    sparse = folder / "sparse"
+    sparse, inner = folder / "sparse", folder / "colmap"
     parts = sorted(path for path in sparse.glob("*") if _images_file(path))
     if not parts:
-        return sparse if _images_file(sparse) else None
+        found = find_model(inner) if inner.is_dir() else None
+        return sparse if _images_file(sparse) else found
     if len(parts) == 1:
         return parts[0]
     counts = {part: _count_images(part) for part in parts}

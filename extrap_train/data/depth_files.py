@@ -29,6 +29,8 @@ ARRAY_ERRORS = (
 MAX_DEPTH_SCALE = 1e6
 """Scene units per unit of a depth file; a larger one is damage."""
 
+_NO_DEPTH_16_BIT = 65_535
+"""What sensors write where they measured nothing, or more than sixteen bits can say."""
 _SIXTEEN_BIT_MODES = ("I;16", "I;16B")
 _DEPTH_MODES = (*_SIXTEEN_BIT_MODES, "I", "F")
 
@@ -48,9 +50,9 @@ class DepthFile:
     def read(self, root: Path, size: tuple[int, int]) -> Float[Tensor, "h w"]:
         """The depth in scene units at `size` (height, width); 0 where unknown or not trusted.
 
-        A greyscale picture of 16 bits, a TIFF of 32, an NPY array, or a file of Record3D's, of the
-        shape of `size`: it is resampled from the nearest pixels. An empty map, and a scale that
-        cannot be, is an error.
+        A greyscale picture of 16 bits, whose largest value is none, a TIFF of 32, an NPY array, or
+        a file of Record3D's, of the shape of `size`: it is resampled from the nearest pixels. An
+        empty map, and a scale that cannot be, is an error.
         """
         path = root / self.path
         if self.is_half_float:
@@ -76,6 +78,8 @@ class DepthFile:
         with np.errstate(invalid="ignore", over="ignore"):
             depth = raw.astype(np.float32) * np.float32(self.scale)
         depth[~(np.isfinite(depth) & (depth > 0))] = 0
+        if raw.dtype.kind == "u" and raw.dtype.itemsize == 2:
+            depth[raw == _NO_DEPTH_16_BIT] = 0
         if not depth.any():
             raise InputError(
                 f"{path}: the depth map is zero everywhere; remove it or its frame, or estimate "

@@ -181,7 +181,7 @@ def _coefficients(entry: dict[str, Any], fisheye: bool) -> dict[str, float]:
         key: number_of({"distortion_params": value}, "distortion_params")
         for key, value in zip(_PARAMS, listed, strict=False)
     }
-    if found and any(found.get(key, 0.0) != value for key, value in from_list.items()):
+    if any(found.get(key, value) != value for key, value in from_list.items()):
         raise ValueError("distortion_params and k1, k2 … say different things: remove one of them")
     return found | from_list
 

@@ -18,8 +18,12 @@ from extrap_train.data.camera_check import (
 )
 from extrap_train.errors import InputError
 from extrap_train.geometry.foreign_cameras import (
+    camera_from_viewpoint,
+    colmap_from_world_to_cam,
     opengl_from_world_to_cam,
     rigid_inverse,
+    viewpoint_from_camera,
+    world_to_cam_from_colmap,
     world_to_cam_from_opengl,
 )
 from extrap_train.views import Camera, stack_cameras
@@ -95,6 +99,36 @@ def test_other_conventions_are_named(name, said):
 def test_models_with_the_inverse_poses_are_named():
     misread = replace(orbit(), world_to_cam=rigid_inverse(orbit().world_to_cam))
     assert "as if they were camera-to-world" in find_pose_fault(misread, COLMAP_POSES)
+
+
+def test_quaternions_in_another_order_are_named():
+    true = SOUND["away from the origin"]  # around the origin, any rotation looks at it
+    wxyz, translation = colmap_from_world_to_cam(true.world_to_cam)
+    misread = world_to_cam_from_colmap(wxyz.roll(-1, dims=-1), translation)
+    fault = find_pose_fault(replace(true, world_to_cam=misread), COLMAP_POSES)
+    assert "as if they were quaternions in the order x, y, z, w" in fault
+
+
+def test_rotations_of_pytorch3d_that_are_transposed_are_named():
+    true = viewpoint_from_camera(SOUND["away from the origin"])
+    read = camera_from_viewpoint(replace(true, rotation=true.rotation.mT), 64, 64)
+    assert "with R transposed" in find_pose_fault(read, CO3D_POSES)
+
+
+@pytest.mark.parametrize(
+    ("linear", "cause"),
+    [
+        (np.diag([1, -1, 1]), "mirrored"),
+        (np.diag([1, 1.02, 1]), "scaled unevenly"),
+        (np.diag([np.nan, 1, 1]), "NaN"),
+    ],
+)
+def test_what_makes_a_pose_degenerate_is_named(linear, cause):
+    camera = with_lens(96, 96, 90, 90, 48, 48)
+    matrix = camera.world_to_cam.clone()
+    matrix[:3, :3] = matrix[:3, :3] @ torch.tensor(linear, dtype=torch.float32)
+    with pytest.raises(InputError, match=cause):
+        require_sound(replace(camera, world_to_cam=matrix), "one.png", Path("cameras.json"))
 
 
 @pytest.mark.parametrize(

@@ -316,3 +316,11 @@ def test_a_lone_name_that_is_no_unicode(root, file, letter):
     path.write_bytes(gzip.compress(json.dumps(entries).encode()))
     message = complaint_of(read_category, root, "cup")
     assert f"{file}: entry 0 is malformed (sequence_name 's5\\u{letter:x}' is no" in message
+
+
+def test_a_frame_that_is_a_crop_of_its_photograph_is_read(root):
+    entry = frame_entries(root)[0]
+    entry["viewpoint"]["principal_point"] = [-1.6, -1.8]  # outside of the picture
+    replace_frame_entries(root, [entry])
+    (sequence,) = read_category(root, "cup")
+    assert len(sequence.frames) == 1

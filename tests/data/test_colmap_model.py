@@ -297,6 +297,10 @@ def test_the_largest_of_several_models_is_read(tmp_path, caplog):
         assert find_model(tmp_path) == tmp_path / "sparse" / "1"
     assert "0 has 1, 10 has 2" in caplog.text
     assert find_model(tmp_path / "sparse" / "0") == tmp_path / "sparse" / "0"
+    (tmp_path / "sparse").rename(tmp_path / "nerfstudio's")
+    (tmp_path / "colmap").mkdir()
+    (tmp_path / "nerfstudio's").rename(tmp_path / "colmap" / "sparse")
+    assert find_model(tmp_path) == tmp_path / "colmap" / "sparse" / "1"
 
 
 def test_empty_lines_around_the_text_mean_nothing(tmp_path):

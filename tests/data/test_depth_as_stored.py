@@ -40,6 +40,14 @@ def test_depth_of_fewer_pixels_is_that_of_the_nearest(tmp_path, name, kind, time
     assert np.allclose(found, np.kron(_DEPTH, np.ones((times, times))) * 0.001, rtol=1e-6)
 
 
+@pytest.mark.parametrize(("name", "kind"), [("d.png", "u2"), ("d.npy", "u2"), ("d.npy", ">u2")])
+def test_the_largest_number_of_sixteen_bits_is_no_depth(tmp_path, name, kind):
+    raw = _DEPTH.astype(kind)
+    raw[2:4, 3] = 65_535
+    found = read_depth(_save_depth(tmp_path / name, raw), (6, 8), 0.001).numpy()
+    assert np.allclose(found, np.where(raw == 65_535, 0, _DEPTH) * 0.001, rtol=1e-6)
+
+
 def test_depth_of_more_pixels_is_sampled(tmp_path):
     large = np.kron(_DEPTH, np.ones((3, 3), np.uint16))
     path = _save_depth(tmp_path / "d.png", large)

@@ -78,6 +78,8 @@ def test_a_fisheye_lens_by_each_name(said):
 def test_a_list_of_coefficients_has_nerfstudios_order():
     listed = lens(**PINHOLE, distortion_params=[-0.2, 0.12, -0.1, 0.2, 0.001, 0.002])
     assert listed == lens(**PINHOLE, **RADIAL, p1=0.001, p2=0.002)
+    both = {"distortion_params": [*RADIAL.values(), 0, 0], "p1": 0, "p2": 0}
+    assert lens(**PINHOLE, **both) == lens(**PINHOLE, **RADIAL)
 
 
 def test_four_coefficients_are_those_of_a_fisheye_or_have_no_more_than_two_terms():
