@@ -36,7 +36,7 @@ def open_video(path: Path) -> Iterator[cv2.VideoCapture]:
         raise InputError(
             f"{path}: is not a video (MP4, MOV, AVI, Matroska or WebM); restore or convert the file"
         )
-    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     video = cv2.VideoCapture(str(path.absolute()), cv2.CAP_FFMPEG)
     cv2.utils.logging.setLogLevel(level)
     try:
