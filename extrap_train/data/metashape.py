@@ -19,9 +19,9 @@ from extrap_train.data.photogrammetry import PosedPicture, find_description, seq
 from extrap_train.data.sequences import FrameSequence
 from extrap_train.data.xml_files import read_xml
 from extrap_train.errors import InputError
-from extrap_train.geometry.foreign_cameras import flip_up_and_forward
+from extrap_train.geometry.foreign_cameras import PANORAMA, flip_up_and_forward
 
-_MODELS = {"frame": PERSPECTIVE, "fisheye": "OPENCV_FISHEYE"}
+_MODELS = {"frame": PERSPECTIVE, "fisheye": "OPENCV_FISHEYE", "spherical": PANORAMA}
 _PARAMETERS = ("f", "cx", "cy", "b1", "b2", *(f"{kind}{i}" for kind in "kp" for i in range(1, 5)))
 _TANGENTIAL = {"p1": "p2", "p2": "p1"}
 _MAX_SKEW_PIXELS = 0.5
@@ -114,27 +114,30 @@ def _lens(sensor: Element | None, _picture: Path) -> dict[str, Any]:
     kind = sensor.get("type", "frame")
     if kind not in _MODELS:
         raise ValueError(
-            f"its sensor is of type {kind!r:.40}, not frame or fisheye: export undistorted pictures"
+            f"its sensor is of type {kind!r:.40}, none of {', '.join(_MODELS)}: export undistorted "
+            "pictures"
         )
-    calibrations = sensor.findall("calibration")
-    if not calibrations:
-        raise KeyError("calibration")
-    calibration = min(calibrations, key=lambda c: c.get("class") == "initial")
+    calibration = min(
+        sensor.findall("calibration"),
+        key=lambda one: one.get("class") == "initial",
+        default=Element("calibration"),  # of a spherical sensor, which needs none
+    )
     sizes = [*calibration.findall("resolution"), *sensor.findall("resolution")]
     if not sizes:
         raise KeyError("resolution")
     width, height = (number_of(dict(sizes[0].attrib), side) for side in ("width", "height"))
     said = {part.tag: part.text for part in calibration if part.tag in _PARAMETERS}
     values = {key: number_of(said, key) for key in said}
-    focal, skew = values.pop("f"), values.pop("b2", 0.0)
-    if not abs(skew) * height <= 2 * _MAX_SKEW_PIXELS * abs(focal):
-        raise ValueError(f"b2 is a skew of {skew:g}, which cannot be undone: fix it at 0")
-    return {
-        **{"w": width, "h": height, "camera_model": _MODELS[kind]},
-        **{"fl_x": focal + values.pop("b1", 0.0), "fl_y": focal},
-        **{"cx": width / 2 + values.pop("cx", 0.0), "cy": height / 2 + values.pop("cy", 0.0)},
-        **{_TANGENTIAL.get(key, key): value for key, value in values.items()},
-    }
+    lens = {"cx": width / 2 + values.pop("cx", 0.0), "cy": height / 2 + values.pop("cy", 0.0)}
+    if kind == "spherical":
+        values.pop("f", None)  # the width in radians
+    else:
+        focal, skew = values.pop("f"), values.pop("b2", 0.0)
+        if not abs(skew) * height <= 2 * _MAX_SKEW_PIXELS * abs(focal):
+            raise ValueError(f"b2 is a skew of {skew:g}, which cannot be undone: fix it at 0")
+        lens |= {"fl_x": focal + values.pop("b1", 0.0), "fl_y": focal}
+    lens |= {_TANGENTIAL.get(key, key): value for key, value in values.items()}
+    return {"w": width, "h": height, "camera_model": _MODELS[kind]} | lens
 
 
 def _numbers(element: Element, count: int) -> Float[np.ndarray, " n"]:

@@ -153,6 +153,30 @@ def test_a_fisheye_lens(tmp_path):
         np.testing.assert_allclose(dot_of(view.image), seen, atol=0.1)
 
 
+@pytest.mark.parametrize("calibrated", [False, True])
+def test_a_panorama(tmp_path, calibrated):
+    """The manual's spherical camera; each dot is in the views that look that way."""
+    width, height = 360, 180
+    size = f'<resolution width="{width}" height="{height}"/>'
+    own = f'<calibration type="spherical">{size}<f>57.2957795</f></calibration>'
+    folder = write(tmp_path, sensors=sensor(size + own * calibrated, "spherical"))
+    point = np.array([0.9, 0.1, 0.4])
+    for index, shot in enumerate(SHOTS):
+        x, y = shot.directions(point)
+        assert (point - shot.position) @ shot.forward > 0
+        pixel = np.arctan2(x, 1), np.arctan2(y, np.hypot(x, 1))
+        pixel = np.array([width / 2, height / 2]) + width / 2 / np.pi * np.array(pixel)
+        save_dot(tmp_path / f"images/IMG_{index}.png", pixel, width, height)
+    views = [frame.load() for frame in open_scene(folder).frames]
+    assert len(views) == 6 * len(SHOTS)
+    shown = [view for view in views if view.image[:, 9:-9, 9:-9].max() > 0.8]
+    assert len(shown) >= len(SHOTS)
+    for view in shown:
+        seen = pixels_of(view.camera, point[None])[0]
+        # A view stretches what is round in the panorama, which moves its centroid outwards.
+        np.testing.assert_allclose(dot_of(view.image), seen, atol=0.4)
+
+
 @pytest.mark.parametrize(
     "entry",
     [
@@ -189,7 +213,8 @@ def test_labels_lead_nowhere_else(tmp_path, label):
 @pytest.mark.parametrize(
     "sensors",
     [
-        sensor(calibration(**LENS), "spherical"),
+        sensor(calibration(**LENS), "cylindrical"),
+        sensor(calibration(f=50), "spherical"),
         sensor(""),
         sensor(calibration()),
         sensor(calibration(f="nan")),
