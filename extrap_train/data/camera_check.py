@@ -144,17 +144,21 @@ class PoseConvention:
     """What they may be instead, each with what makes the `world_to_cam` that was read right."""
 
 
-def _quaternions_rolled(read: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 4 4"]:
+ROLLED = "quaternions in the order x, y, z, w"
+TRANSPOSED = "PyTorch3D's with R transposed, for column vectors"
+
+
+def quaternions_rolled(read: Float[Tensor, "*n 4 4"]) -> Float[Tensor, "*n 4 4"]:
     """Poses whose quaternions w, x, y, z were read are x, y, z, w."""
     wxyz, translation = colmap_from_world_to_cam(read)
     return world_to_cam_from_colmap(wxyz.roll(1, dims=-1), translation)
 
 
-def _transposed_in_file(read: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 4 4"]:
+def rotations_transposed(read: Float[Tensor, "*n 4 4"]) -> Float[Tensor, "*n 4 4"]:
     """Poses of which PyTorch3D's R was read is its transpose."""
     right = read.clone()
     flip = read.new_tensor([-1.0, -1.0, 1.0])
-    right[:, :3, :3] = flip[:, None] * read[:, :3, :3].mT * flip
+    right[..., :3, :3] = flip[:, None] * read[..., :3, :3].mT * flip
     return right
 
 
@@ -174,12 +178,12 @@ COLMAP_POSES = PoseConvention(
     "world-to-camera, as COLMAP writes them",
     {
         "camera-to-world": rigid_inverse,
-        "quaternions in the order x, y, z, w": _quaternions_rolled,
+        ROLLED: quaternions_rolled,
     },
 )
 CO3D_POSES = PoseConvention(
     "PyTorch3D's, as CO3D has them",
-    {"PyTorch3D's with R transposed, for column vectors": _transposed_in_file},
+    {TRANSPOSED: rotations_transposed},
 )
 
 

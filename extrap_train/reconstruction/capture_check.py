@@ -15,6 +15,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from extrap_train.data.camera_check import (
+    ROLLED,
+    TRANSPOSED,
+    quaternions_rolled,
+    rotations_transposed,
+)
 from extrap_train.errors import InputError
 from extrap_train.geometry.cameras import project, transform, unproject_to_world
 from extrap_train.geometry.epipolar import (
@@ -312,7 +318,12 @@ def _read_otherwise(camera: Camera) -> dict[str, Camera]:
         name: torch.diag(torch.tensor([*signs, 1.0])) @ camera.world_to_cam
         for name, signs in _FLIPS.items()
     }
-    matrices = flipped | {"camera-to-world matrices": camera.cam_to_world}
+    matrices = flipped | {
+        "camera-to-world matrices": camera.cam_to_world,
+        # Around the world's origin, cameras read in these two ways still look at it.
+        ROLLED: quaternions_rolled(camera.world_to_cam),
+        TRANSPOSED: rotations_transposed(camera.world_to_cam),
+    }
     return {name: replace(camera, world_to_cam=found) for name, found in matrices.items()}
 
 

@@ -8,6 +8,12 @@ import scenes
 import torch
 from orbits import even, ring
 
+from extrap_train.data.camera_check import (
+    ROLLED,
+    TRANSPOSED,
+    quaternions_rolled,
+    rotations_transposed,
+)
 from extrap_train.data.sequences import Frame
 from extrap_train.depth import DatasetDepth
 from extrap_train.errors import InputError
@@ -80,6 +86,25 @@ def test_a_wrong_axis_convention_is_named(signs, name):
     flip = torch.diag(torch.tensor([*signs, 1.0]))
     wrong = [
         replace(v, camera=replace(v.camera, world_to_cam=flip @ v.camera.world_to_cam))
+        for v in views
+    ]
+    with pytest.raises(InputError, match=rf"poses contradict the photographs.*{name}"):
+        check_poses(wrong)
+
+
+@pytest.mark.parametrize(
+    ("misread", "name"),
+    [
+        # The inverse of a roll by one place is one by three.
+        (lambda m: quaternions_rolled(quaternions_rolled(quaternions_rolled(m))), ROLLED),
+        (rotations_transposed, TRANSPOSED),  # its own inverse
+    ],
+)
+def test_rotations_read_in_another_order_are_named(misread, name):
+    poses = [(40, 10.0), (50, 30.0), (60, 15.0)]
+    views = [bumpy(scenes.orbit_camera(a, elevation_deg=e, size=256)) for a, e in poses]
+    wrong = [
+        replace(v, camera=replace(v.camera, world_to_cam=misread(v.camera.world_to_cam)))
         for v in views
     ]
     with pytest.raises(InputError, match=rf"poses contradict the photographs.*{name}"):
