@@ -42,8 +42,10 @@ def packaged_steps(name: str) -> int | None:
 
 
 def packaged_name(family: str, category: str) -> str:
-    """`ours-hydrant`; the published families are of no category: `zeronvs`, `megascenes`."""
-    return f"{family}-{category}" if family == "ours" else family
+    """`ours-hydrant`, for all categories `base`; the published families have one model for all."""
+    if family != "ours":
+        return family
+    return "base" if category == "all" else f"{family}-{category}"
 
 
 def compress(state: Mapping[str, Tensor], base: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -14,6 +14,7 @@ _COMPARED = ["base", "megascenes", *(f"ours-{category}" for category in _CATEGOR
 def test_every_compared_model_is_there() -> None:
     assert packaged_names() == sorted(_COMPARED)
     assert packaged_name("ours", "cup") == "ours-cup"
+    assert packaged_name("ours", "all") in packaged_names()
     assert packaged_name("zeronvs", "cup") == "zeronvs"
 
 
