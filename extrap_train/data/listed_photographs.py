@@ -119,6 +119,7 @@ def sequence_of_photographs(
         left_out=tuple(left_out),
         listed=tuple(all_names),
         point_cloud=point_cloud,
+        poses=str(description),
     )
 
 

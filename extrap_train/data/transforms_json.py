@@ -24,7 +24,7 @@ from extrap_train.views import Camera, stack_cameras
 
 TRANSFORMS = "transforms.json"
 KEYS = LENS_KEYS | {
-    *("w", "h", "transform_matrix", "mask_path", "ply_file_path", "applied_scale"),
+    *("w", "h", "transform_matrix", "mask_path", "ply_file_path", "applied_scale", "poses"),
     *("depth_file_path", "depth_unit_scale_factor", "depth_path", "integer_depth_scale"),
 }
 """Entries read from the top level, where they hold for all frames."""
@@ -47,7 +47,7 @@ def read_transforms(folder: Path) -> FrameSequence:
         except InputError as error:
             unusable.append(str(error))
     cloud = content.get("ply_file_path")
-    return sequence_of_photographs(
+    sequence = sequence_of_photographs(
         files,
         folder.resolve().name,
         listed,
@@ -56,6 +56,8 @@ def read_transforms(folder: Path) -> FrameSequence:
         unusable,
         point_cloud=PointFile(folder, check_relative(str(cloud), file)) if cloud else None,
     )
+    source = content.get("poses")
+    return replace(sequence, poses=f"{file}, of {source!a:.100}") if source else sequence
 
 
 def read_cameras(file: Path) -> tuple[list[str], Camera]:

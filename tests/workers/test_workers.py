@@ -10,19 +10,34 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
+import roma
 import torch
-from posed_folders import write_transforms
+from PIL import Image
+from posed_folders import to_bytes, write_transforms
 from traced_scenes import SCENES, orbit_camera, render
 
 from extrap_train import open_views, warp_view
 from extrap_train.config import FilesDepthConfig
+from extrap_train.data.scene_spec import open_scene
 from extrap_train.errors import InputError
+from extrap_train.views import Camera
 
 WORKERS = Path(__file__).parents[2] / "workers"
 SCENE = SCENES["box on the ground"]
 UNIT = 0.3
 """Of the stand-ins' depth, in scene units."""
-CAMERAS = [orbit_camera(azimuth, 128).cropped(16, 0, 90, 128) for azimuth in (0, 12, 24)]
+CAMERAS = [orbit_camera(azimuth, 128).cropped(19, 0, 90, 128) for azimuth in (0, 12, 24)]
+
+
+STEPS = [camera.world_to_cam @ CAMERAS[0].cam_to_world for camera in CAMERAS]
+"""Here, not in the networks, where products may have few bits."""
+
+
+def own_camera(index: int, height: int, width: int) -> Camera:
+    """What a network says that finds cameras: the first is the world, in its own unit."""
+    step = STEPS[index].clone()
+    step[:3, 3] /= UNIT
+    return replace(CAMERAS[index].resized(height, width), world_to_cam=step)
 
 
 def exact(index: int, height: int, width: int) -> torch.Tensor:
@@ -40,13 +55,20 @@ class DepthAnything3(torch.nn.Module):
     def input_processor(self, image, extrinsics, intrinsics, process_res, process_res_method):
         assert (process_res, process_res_method) == (504, "upper_bound_resize")
         pixels = torch.from_numpy(np.stack(image)).permute(0, 3, 1, 2) / 255
-        return pixels, *(torch.from_numpy(part).float() for part in (extrinsics, intrinsics))
+        cameras = (extrinsics, intrinsics)
+        return pixels, *(None if x is None else torch.from_numpy(x).float() for x in cameras)
 
     def forward(self, image, extrinsics=None, intrinsics=None, export_feat_layers=None):
         assert export_feat_layers == []
         _, count, _, height, width = image.shape
-        first = CAMERAS[0]
-        steps = [first.world_to_cam @ camera.cam_to_world for camera in CAMERAS]
+        depth = torch.stack([exact(i, height, width) for i in range(count)])[None]
+        output = {"depth": depth, "depth_conf": torch.full_like(depth, 4.0)}
+        if extrinsics is None:
+            own = [own_camera(index, height, width) for index in range(count)]
+            poses = torch.stack([camera.world_to_cam[:3] for camera in own])[None]
+            lenses = torch.stack([camera.intrinsics for camera in own])[None]
+            return output | {"extrinsics": poses, "intrinsics": lenses}
+        steps = [torch.linalg.inv(step) for step in STEPS]
         unit = torch.stack([step[:3, 3].norm() for step in steps]).median().clamp_min(0.1)
         for index, camera in enumerate(CAMERAS):
             k = camera.resized(height, width).intrinsics
@@ -54,8 +76,7 @@ class DepthAnything3(torch.nn.Module):
             step = torch.linalg.inv(extrinsics[0, index])
             torch.testing.assert_close(step[:3, :3], steps[index][:3, :3], rtol=0, atol=1e-5)
             torch.testing.assert_close(step[:3, 3] * unit, steps[index][:3, 3], rtol=0, atol=1e-5)
-        depth = torch.stack([exact(i, height, width) for i in range(count)])[None]
-        return {"depth": depth, "depth_conf": torch.full_like(depth, 4.0)}
+        return output
 
 
 class MapAnything(torch.nn.Module):
@@ -71,16 +92,20 @@ class MapAnything(torch.nn.Module):
         for index, view in enumerate(views):
             height, width = view["img"].shape[2:]
             camera = CAMERAS[index].resized(height, width)
-            torch.testing.assert_close(
-                view["intrinsics"][0], camera.intrinsics, rtol=1e-4, atol=1e-3
-            )
-            torch.testing.assert_close(view["camera_poses"][0], camera.cam_to_world)
-            assert not view["is_metric_scale"].item()
+            if "intrinsics" in view:
+                torch.testing.assert_close(
+                    view["intrinsics"][0], camera.intrinsics, rtol=1e-4, atol=1e-3
+                )
+                torch.testing.assert_close(view["camera_poses"][0], camera.cam_to_world)
+                assert not view["is_metric_scale"].item()
+            own = own_camera(index, height, width)
             depth = exact(index, height, width)[None]
             mask = torch.ones_like(depth, dtype=torch.bool)
             mask[:, :7] = False
             conf = torch.full_like(depth, 4.0)
-            predictions.append({"depth_z": depth[..., None], "conf": conf, "mask": mask[..., None]})
+            maps = {"depth_z": depth[..., None], "conf": conf, "mask": mask[..., None]}
+            cameras = {"intrinsics": own.intrinsics, "camera_poses": own.cam_to_world}
+            predictions.append(maps | {name: x[None] for name, x in cameras.items()})
         return predictions
 
 
@@ -91,7 +116,7 @@ def preprocess_inputs(views, resize_mode, size):
     return [
         view
         | {"img": view["img"].permute(2, 0, 1)[None] / 255}
-        | {name: view[name][None] for name in ("intrinsics", "camera_poses")}
+        | {name: view[name][None] for name in ("intrinsics", "camera_poses") if name in view}
         for view in views
     ]
 
@@ -109,7 +134,36 @@ class VGGT(torch.nn.Module):
         assert height % 14 == width % 14 == 0
         assert 0 <= images.min() < images.max() <= 1
         depth = torch.stack([exact(i, height, width) for i in range(count)])[None]
-        return {"depth": depth[..., None], "depth_conf": torch.full_like(depth, 4.0)}
+        own = [own_camera(i, height, width) for i in range(count)]
+        encoded = [
+            torch.cat([pose[:3, 3], roma.rotmat_to_unitquat(pose[:3, :3]), _fields(camera)])
+            for pose, camera in ((camera.world_to_cam, camera) for camera in own)
+        ]
+        return {
+            "depth": depth[..., None],
+            "depth_conf": torch.full_like(depth, 4.0),
+            "pose_enc": torch.stack(encoded)[None],
+        }
+
+
+def _fields(camera):
+    """Vertical and horizontal field of view."""
+    size = torch.tensor([camera.height, camera.width])
+    return 2 * torch.atan(size / 2 / camera.intrinsics.diagonal()[:2].flip(0))
+
+
+def pose_encoding_to_extri_intri(pose_encoding, image_size_hw):
+    """That of vggt.utils.pose_enc: translation, quaternion (scalar last) and fields of view."""
+    height, width = image_size_hw
+    turn = roma.unitquat_to_rotmat(pose_encoding[..., 3:7])
+    poses = torch.cat([turn, pose_encoding[..., :3, None]], -1)
+    k = torch.zeros_like(turn)
+    k[..., 1, 1], k[..., 0, 0] = (
+        side / 2 / torch.tan(field / 2)
+        for side, field in zip((height, width), pose_encoding[..., 7:].unbind(-1), strict=True)
+    )
+    k[..., 0, 2], k[..., 1, 2], k[..., 2, 2] = width / 2, height / 2, 1
+    return poses, k
 
 
 STAND_INS = {
@@ -117,6 +171,7 @@ STAND_INS = {
     "mapanything.models": {"MapAnything": MapAnything},
     "mapanything.utils.image": {"preprocess_inputs": preprocess_inputs},
     "vggt.models.vggt": {"VGGT": VGGT},
+    "vggt.utils.pose_enc": {"pose_encoding_to_extri_intri": pose_encoding_to_extri_intri},
 }
 
 
@@ -161,6 +216,55 @@ def test_a_worker_gives_the_exact_warp(scene, tmp_path, load, worker):
     both = (warp.mask * wanted.mask)[:, None]
     assert both.mean() > 0.5
     assert ((warp.image - wanted.image).abs() * both).mean() < 0.02
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory):
+    """The photographs alone, one of them stored on its side and one with a mask beside it."""
+    folder = tmp_path_factory.mktemp("photographs")
+    for index, camera in enumerate(CAMERAS):
+        picture = Image.fromarray(to_bytes(render(SCENE, camera).image.permute(1, 2, 0)))
+        exif = Image.Exif()
+        if index == 1:
+            exif[0x0112] = 6
+            picture = picture.transpose(Image.Transpose.ROTATE_90)
+        picture.save(folder / f"{index}.png", exif=exif)
+    Image.new("L", (128, 90), 255).save(folder / "0_mask.png")
+    return str(folder)
+
+
+@pytest.mark.parametrize("worker", ["run_depth_anything_3", "run_map_anything", "run_vggt"])
+def test_photographs_without_cameras_become_a_scene(photographs, tmp_path, load, worker):
+    folder = str(tmp_path / "scene")
+    load(worker).estimate_depth(photographs, folder)
+    sequence = open_scene(folder)
+    assert [frame.path for frame in sequence.frames] == [f"images/{i}.png" for i in range(3)]
+    assert "transforms.json" in sequence.poses
+    for index, frame in enumerate(sequence.frames):
+        own = own_camera(index, 90, 128)
+        torch.testing.assert_close(frame.camera.intrinsics, own.intrinsics, rtol=1e-3, atol=0.1)
+        torch.testing.assert_close(frame.camera.world_to_cam, own.world_to_cam, rtol=0, atol=1e-4)
+    views = open_views(
+        folder, depth=FilesDepthConfig(folder=f"{folder}/depth", image_size=90), size=90
+    )
+    truth = []
+    for view, camera in zip(views, CAMERAS, strict=True):
+        true = render(SCENE, replace(view.camera, world_to_cam=camera.world_to_cam)).depth / UNIT
+        truth.append(replace(view, depth=true))
+        known = view.depth > 0
+        assert known.float().mean() > 0.85
+        assert (view.depth / true - 1).abs()[known].median() < 0.01
+    warp, wanted = (warp_view(given[:2], views[2].camera, size=90) for given in (views, truth))
+    both = (warp.mask * wanted.mask)[:, None]
+    assert both.mean() > 0.5
+    assert ((warp.image - wanted.image).abs() * both).mean() < 0.02
+    assert ((warp.image - views[2].image).abs() * both).mean() < 0.05  # another view: 0.15
+
+
+def test_the_photographs_folder_is_not_written_to(photographs, load):
+    with pytest.raises(SystemExit, match="another folder"):
+        load("run_vggt").estimate_depth(photographs, photographs)
+    assert not Path(photographs, "transforms.json").exists()
 
 
 def test_photographs_are_chosen_by_name(scene, tmp_path, load):
