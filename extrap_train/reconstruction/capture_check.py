@@ -107,6 +107,14 @@ class CaptureCheck:
     problems: list[str] = field(default_factory=list)
     """One line each."""
 
+    @property
+    def residuals(self) -> tuple[float, float]:
+        """Median distances in pixels, over all views, of matches from their epipolar lines and of
+        points of two views from where a third has them; NaN for too few."""
+        third = [np.linalg.norm(m.third - m.reprojected, axis=1) for m in self.matched]
+        distances = np.concatenate([m.distances for m in self.matched])
+        return _median(distances), _median(np.concatenate(third), MIN_POINTS)
+
 
 def check_capture(views: Sequence[View]) -> CaptureCheck:
     """Match three views or more; every problem names its views and likely cause."""

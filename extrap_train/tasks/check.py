@@ -1,5 +1,7 @@
 """`task=check`: one picture that proves a scene's poses, scale, lens and masks, or shows faults."""
 
+import math
+
 from extrap_train.config import TrainConfig
 from extrap_train.data.square_frames import load_readable, select_input_frames
 from extrap_train.errors import InputError
@@ -39,6 +41,15 @@ def run(config: TrainConfig) -> None:
     manifest = scene_manifest(config, frames, {}, {})
     with claim(folder, manifest, resume=False) as result, result.replace() as whole:
         draw_check(check, whole / "check.png")
+    distance, reprojection = (
+        f"{pixels:.2f} px" if math.isfinite(pixels) else "an unknown distance"
+        for pixels in check.residuals
+    )
+    console.print(f"poses: {sequence.poses or 'the data set'}", markup=False)
+    console.print(
+        f"median residuals: matches lie {distance} from their epipolar lines, points of two views "
+        f"{reprojection} from where a third has them"
+    )
     for problem in check.problems:
         console.print(problem)
     if not check.problems:

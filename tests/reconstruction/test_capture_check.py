@@ -92,6 +92,8 @@ def test_a_right_capture_has_no_problem(views, tmp_path):
     assert check.problems == []
     assert all(each.distance < 0.5 for each in check.matched)
     assert all(each.reprojection < 1.0 for each in check.matched)
+    assert check.residuals[0] < 0.5
+    assert check.residuals[1] < 1.0
     draw_check(check, tmp_path / "check.png")
     assert (tmp_path / "check.png").stat().st_size > 10_000
 

@@ -14,6 +14,7 @@ def test_a_check_draws_its_picture_each_time(tmp_path):
     said = run_command(main, *command)
     picture = tmp_path / "out" / "check" / "garden" / "check.png"
     assert said.endswith(f"result: {picture}\n")
+    assert f"poses: {tmp_path}/garden/transforms.json\n" in said
     assert "overlap" in said  # 32 pixels have no features
     Image.open(picture).verify()
     assert run_command(main, *command, "seed=1") == said

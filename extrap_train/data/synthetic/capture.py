@@ -41,7 +41,7 @@ def synthetic_sequence(category: str, index: int, options: SyntheticConfig) -> F
         whole = WholePhotograph(f"{category}/{sequence_name(index)}/{name}", camera)
         load = _Renderer(scene, whole, name).load
         frames.append(Frame(name, camera, True, True, load, (), path=whole.path))
-    return FrameSequence(category, sequence_name(index), tuple(frames))
+    return FrameSequence(category, sequence_name(index), tuple(frames), poses="the renderer")
 
 
 @dataclass(frozen=True)
