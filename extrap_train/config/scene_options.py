@@ -100,7 +100,7 @@ class ConfidenceConfig:
         0.5, "share of a view's testable pixels that must agree with the map", low=0, high=1
     )
     least_confidence: float = option(
-        0.1, "confidence below which a point is left out of the cloud", low=0, high=1
+        0.2, "confidence below which a point is left out of the cloud", low=0, high=1
     )
 
 
@@ -135,6 +135,11 @@ class CompletionConfig:
         "what new views are generated from: the photographs alone, or from generated views, too, "
         "as in the paper",
         choices=("photographs", "all"),
+    )
+    symmetry: bool = option(
+        True,
+        "mirror the photographs in the object's planes of symmetry where they confirm any; needs "
+        "masks of the object",
     )
     edges: int = option(4, "known views that a new one is aligned to", low=1, high=64)
     tolerance: float = option(

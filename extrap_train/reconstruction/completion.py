@@ -2,14 +2,16 @@
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 from torch.nn import functional
 
 from extrap_train.config import CompletionConfig
 from extrap_train.depth import DepthSource
-from extrap_train.diffusion.generator import ViewGenerator
+from extrap_train.diffusion.generator import DiffusionGenerator, ViewGenerator
 from extrap_train.geometry.cameras import unproject
 from extrap_train.reconstruction.depth_prediction.inference import DepthPredictor
 from extrap_train.reconstruction.global_map import (
@@ -53,6 +55,22 @@ class CompletionPipeline:
     seed: int
     predictor: DepthPredictor | None = None
     """Predicts the generated views' depth instead of `source`."""
+    mirrored: tuple[MapView, ...] = ()
+    """Photographs in the object's plane of symmetry, which new views are made from and aligned to
+    as to the photographs; they are never part of the map.
+    """
+
+    def with_mirrored(self, mirrored: Sequence[MapView]) -> "CompletionPipeline":
+        """With mirrored photographs, and a generator that takes as many views again as without."""
+        generator = self.generator
+        if mirrored and isinstance(generator, DiffusionGenerator):
+            most = generator.references or generator.model.config.num_condition_views
+            generator = replace(generator, references=2 * most)
+        return replace(self, generator=generator, mirrored=tuple(mirrored))
+
+    def guided(self, scene_map: GlobalMap) -> GlobalMap:
+        """The map with the mirrored photographs behind its own views."""
+        return replace(scene_map, views=(*scene_map.views, *self.mirrored))
 
 
 def map_of_inputs(
@@ -63,6 +81,13 @@ def map_of_inputs(
     for index, (view, confidence) in enumerate(zip(views, confidences, strict=True)):
         scene_map, _ = scene_map.added(view, confidence, Origin(GIVEN, root=index))
     return scene_map
+
+
+def with_masks(scene_map: GlobalMap, masks: Sequence[Float[Tensor, "h w"] | None]) -> GlobalMap:
+    """The map with the object's mask in each of its views, which it is not kept with on disk."""
+    pairs = zip(scene_map.views, masks, strict=True)
+    views = (replace(view, view=replace(view.view, mask=mask)) for view, mask in pairs)
+    return replace(scene_map, views=tuple(views))
 
 
 def complete(
@@ -76,7 +101,7 @@ def complete(
     left = [query for query in queries if query.name not in done]
     while left:
         started = time.perf_counter()
-        query = next_query(scene_map, left)
+        query = next_query(pipeline.guided(scene_map), left)
         planned = time.perf_counter() - started
         left = [other for other in left if other.name != query.name]
         scene_map, added, step = add_view(scene_map, query, pipeline)
@@ -93,20 +118,20 @@ def add_view(
     While it contradicts the map it is generated again with another seed; the best attempt enters.
     """
     options, clock = pipeline.options, _Clock()
-    only_photographs = options.references == "photographs"
-    references = scene_map.nearest(query.camera, REFERENCES, photographs=only_photographs)
-    neighbours = scene_map.nearest(query.camera, options.edges)
+    known = pipeline.guided(scene_map)
+    references = _references(scene_map, query, pipeline)
+    neighbours = known.nearest(query.camera, options.edges)
     tries = options.confidence.attempts if options.confidence.regenerate else 1
     best: tuple[Proposal, int] | None = None
     attempts = 0
     for seed in range(pipeline.seed, pipeline.seed + tries):
-        picture = _generate_picture(scene_map, query, references, pipeline.generator, seed)
+        picture = _generate_picture(known, query, references, pipeline.generator, seed)
         clock.took("generate")
         if pipeline.predictor is None:
-            proposal = propose(scene_map, picture, neighbours, pipeline.source, options.confidence)
+            proposal = propose(known, picture, neighbours, pipeline.source, options.confidence)
         else:
             proposal = propose_predicted(
-                scene_map, picture, neighbours, pipeline.predictor, options.confidence
+                known, picture, neighbours, pipeline.predictor, options.confidence
             )
         clock.took("align")
         attempts += 1
@@ -118,12 +143,12 @@ def add_view(
     proposal, seed = best
     origin = Origin(
         GENERATED,
-        root=scene_map.views[references[0]].origin.root,
-        references=tuple(references),
+        root=known.views[references[0]].origin.root,
+        references=tuple(index for index in references if index < len(scene_map)),
         seed=seed,
         agreement=proposal.agreement,
     )
-    drift = loop_error(scene_map, query.camera, neighbours)
+    drift = loop_error(known, query.camera, neighbours)
     scene_map, added = scene_map.added(proposal.view, proposal.confidence, origin)
     clock.took("merge")
     step = Step(
@@ -136,6 +161,20 @@ def add_view(
         seconds=clock.seconds,
     )
     return scene_map, added, step
+
+
+def _references(scene_map: GlobalMap, query: Query, pipeline: CompletionPipeline) -> list[int]:
+    """Indices, in the guided map, of what a view is generated from, nearest first.
+
+    Mirrored photographs show the object alone and come in addition: what lies around it is seen
+    from the others.
+    """
+    known = pipeline.guided(scene_map)
+    only_photographs = pipeline.options.references == "photographs"
+    own = scene_map.nearest(query.camera, REFERENCES, photographs=only_photographs)
+    order = known.nearest(query.camera, len(known))
+    mirrored = [index for index in order if index >= len(scene_map)][:REFERENCES]
+    return [index for index in order if index in own or index in mirrored]
 
 
 def loop_error(scene_map: GlobalMap, camera: Camera, neighbours: Sequence[int]) -> float | None:

@@ -11,12 +11,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from extrap_train.config import (
-    DatasetDepthConfig,
-    SyntheticConfig,
-    TrainConfig,
-    dotted,
-)
+from extrap_train.config import DatasetDepthConfig, SyntheticConfig, TrainConfig, dotted
 from extrap_train.data.scene_spec import SYNTHETIC_SCHEME
 from extrap_train.data.sequences import NO_CATEGORY, Frame, FrameSequence
 from extrap_train.data.square_frames import load_readable, require_few_unusable
@@ -27,7 +22,13 @@ from extrap_train.errors import InputError
 from extrap_train.geometry.cameras import WorldFrame
 from extrap_train.reconstruction.capture_check import check_poses
 from extrap_train.reconstruction.cloud_pictures import draw_plan
-from extrap_train.reconstruction.completion import CompletionPipeline, Step, complete, map_of_inputs
+from extrap_train.reconstruction.completion import (
+    CompletionPipeline,
+    Step,
+    complete,
+    map_of_inputs,
+    with_masks,
+)
 from extrap_train.reconstruction.depth_prediction.inference import NetworkDepth
 from extrap_train.reconstruction.depth_prediction.network import load_depth_network
 from extrap_train.reconstruction.exact import ExactDepth, ExactGenerator
@@ -49,6 +50,11 @@ from extrap_train.reconstruction.map_files import (
     view_bytes,
 )
 from extrap_train.reconstruction.planner import Query, expected_order, orbit_queries
+from extrap_train.reconstruction.symmetry import (
+    Symmetry,
+    find_symmetries,
+    mirrored_photographs,
+)
 from extrap_train.reconstruction.viewer import CloudViewer
 from extrap_train.store import Outcome
 from extrap_train.store.digests import file_digest
@@ -195,7 +201,7 @@ def _run(job: _Job, console: Console, watch: Watch | None) -> bool:
     pipeline = _pipeline(job)
     scene_map = _start_map(job, pipeline, console)
     queries = _queries(job, scene_map)
-    # The same plan for a run that resumes.
+    # The same plan, and the same mirror, for a run that resumes.
     start = replace(scene_map, views=scene_map.views[: len(job.inputs)])
     order = expected_order(start, queries)
     draw_plan(start, order, job.folder / "plan.png")
@@ -203,6 +209,8 @@ def _run(job: _Job, console: Console, watch: Watch | None) -> bool:
     if job.config.complete.dry_run:
         console.print(f"plan: {job.folder / 'plan.png'}; nothing was generated")
         return False
+    symmetries, mirrored = _mirror(job, start, console)
+    pipeline = pipeline.with_mirrored(mirrored)
     missing = _count_missing(scene_map, queries)
     require_space(job.folder, missing * view_bytes(pipeline.generator.warp_size))
     with _viewer(job, console) if watch is None else nullcontext(watch) as show:
@@ -214,7 +222,7 @@ def _run(job: _Job, console: Console, watch: Watch | None) -> bool:
             "inputs": load_input_seconds(job.folder / "map"),
             "views": sum(sum(step.seconds.values()) for step in steps),
         }
-        done = Completed(scene_map, steps, job.world, job.truth, seconds)
+        done = Completed(scene_map, steps, job.world, job.truth, seconds, symmetries)
         write_completed(done, job.config, job.sequence, pipeline, job.used, job.folder, console)
     return not missing
 
@@ -264,6 +272,26 @@ def _start_map(job: _Job, pipeline: CompletionPipeline, console: Console) -> Glo
     for index, view in enumerate(scene_map.views):
         save_view(view, None, folder, index)
     return scene_map
+
+
+def _mirror(
+    job: _Job, inputs: GlobalMap, console: Console
+) -> tuple[tuple[Symmetry, ...], tuple[MapView, ...]]:
+    """The object's symmetries that the photographs confirm, and these mirrored."""
+    if not (job.config.complete.symmetry and _is_generated(job.config)):
+        return (), ()
+    size = inputs.views[0].camera.width
+    masks = [frame.load(depth=False).squared(size).mask for frame in job.photographs]
+    inputs = with_masks(inputs, masks)
+    found = find_symmetries(inputs)
+    for symmetry in found:
+        console.print(
+            f"symmetry: a plane maps {symmetry.agreement:.0%} of what is seen of the object onto "
+            f"what is seen, and {symmetry.gain:.0%} to where no photograph looks"
+        )
+    if not found:
+        console.print("symmetry: none that the photographs and their masks confirm")
+    return found, mirrored_photographs(inputs, found)
 
 
 def _map_options(config: TrainConfig) -> dict[str, Any]:

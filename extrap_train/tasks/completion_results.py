@@ -33,6 +33,7 @@ from extrap_train.reconstruction.map_scores import (
 )
 from extrap_train.reconstruction.mesh import write_mesh
 from extrap_train.reconstruction.planner import REFERENCES
+from extrap_train.reconstruction.symmetry import Symmetry
 from extrap_train.runs import provenance
 from extrap_train.store.records import write_summary
 from extrap_train.tasks.scene_inputs import photograph_digests
@@ -57,6 +58,8 @@ class Completed:
     truth: SyntheticScene | None
     seconds: dict[str, float]
     """Seconds spent on the inputs and the views, whichever run made them."""
+    symmetries: Sequence[Symmetry] = ()
+    """The object's, that the photographs were mirrored in."""
 
 
 def write_completed(
@@ -101,6 +104,7 @@ def write_completed(
         "held_out": held_out,
         "splats": splats,
         "missing": missing | no_splats | ({} if faces else {"mesh": _NO_MESH}),
+        "symmetries": [_evidence(symmetry) for symmetry in done.symmetries],
         "loop": drift(done.steps, done.scene_map),
         "consistency_db": view_consistency(done.scene_map),
         "sphere_coverage": coverage_of(done.scene_map),
@@ -113,6 +117,11 @@ def write_completed(
     _print_what_was_added(done, summary, config, console)
     _print_summary(summary, console)
     console.print(f"pictures: {folder / 'growth.png'}\nresult: {folder}")
+
+
+def _evidence(symmetry: Symmetry) -> dict[str, float]:
+    """Shares of the object's points, mirrored: where they fall."""
+    return {name: float(getattr(symmetry, name)) for name in ("agreement", "contradiction", "gain")}
 
 
 def _print_what_was_added(

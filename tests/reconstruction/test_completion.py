@@ -12,15 +12,22 @@ from extrap_train.data.examples import query_batch
 from extrap_train.depth import RELIABLE_CONFIDENCE, DatasetDepth, DepthMap, PointMaps, point_maps_of
 from extrap_train.diffusion.generator import GeneratedViews
 from extrap_train.errors import InputError
+from extrap_train.geometry.mirror import MirrorPlane
 from extrap_train.geometry.viewpoints import pairwise_angles, scene_center
 from extrap_train.geometry.warp import compute_warp
 from extrap_train.reconstruction.cloud import cloud_of
-from extrap_train.reconstruction.completion import CompletionPipeline, complete, map_of_inputs
+from extrap_train.reconstruction.completion import (
+    CompletionPipeline,
+    add_view,
+    complete,
+    map_of_inputs,
+)
 from extrap_train.reconstruction.global_map import GENERATED, GlobalMap, Prior, prior_of
 from extrap_train.reconstruction.map_files import load_map, save_view
 from extrap_train.reconstruction.measurement import Measured, supported
 from extrap_train.reconstruction.new_view import propose
 from extrap_train.reconstruction.planner import Query, next_query, orbit_queries
+from extrap_train.reconstruction.symmetry import Symmetry, mirrored_photographs
 from extrap_train.views import Camera, View, stack_cameras
 
 SIZE = 64
@@ -167,6 +174,33 @@ def test_views_are_generated_from_the_photographs_alone_or_from_all_views(whole)
         assert (max(used) >= len(photographs)) == is_chained
     # Nothing stands nearer to the first new view than the photographs, whatever is allowed.
     assert chained.views[3].origin.references == whole[0].views[3].origin.references
+
+
+def test_mirrored_photographs_show_what_is_behind_and_are_no_part_of_the_map():
+    known = inputs(-30.0, 0.0, 30.0)
+    masks = [(scenes.Scene(SCENE.shapes[:1]).depth(v.camera) > 0).float() for v in known.views]
+    plane = MirrorPlane(torch.tensor([0.0, 0.0, 1.0]), torch.tensor(0.0))
+    mirrored = mirrored_photographs(
+        known, masks, [Symmetry(plane, torch.ones(()), torch.zeros(()))]
+    )
+    asked = []
+
+    @dataclass(frozen=True)
+    class Noting(TracedGenerator):
+        def generate(self, references, queries, names, seed=0):
+            asked.append(list(references))
+            return super().generate(references, queries, names, seed)
+
+    options = CompletionConfig()
+    pipeline = CompletionPipeline(Noting(), TracedDepth(), options, 0).with_mirrored(mirrored)
+    behind = Query("behind", scenes.orbit_camera(180.0, size=SIZE))
+    grown, added, step = add_view(known, behind, pipeline)
+    shown = [reference.name for reference in asked[0]]
+    assert sorted(shown) == sorted(2 * [view.view.name for view in known.views])
+    assert asked[0][0] is mirrored[1].view, "the nearest one first"
+    assert step.edges == 4, "aligned to mirrored photographs, too"
+    assert len(grown) == len(known) + 1
+    assert max(added.origin.references) < len(known)
 
 
 def test_branches_grow_in_turn():
