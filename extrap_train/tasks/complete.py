@@ -27,7 +27,6 @@ from extrap_train.reconstruction.completion import (
     Step,
     complete,
     map_of_inputs,
-    with_masks,
 )
 from extrap_train.reconstruction.depth_prediction.inference import NetworkDepth
 from extrap_train.reconstruction.depth_prediction.network import load_depth_network
@@ -50,16 +49,13 @@ from extrap_train.reconstruction.map_files import (
     view_bytes,
 )
 from extrap_train.reconstruction.planner import Query, expected_order, orbit_queries
-from extrap_train.reconstruction.symmetry import (
-    Symmetry,
-    find_symmetries,
-    mirrored_photographs,
-)
+from extrap_train.reconstruction.symmetry import Symmetry
 from extrap_train.reconstruction.viewer import CloudViewer
 from extrap_train.store import Outcome
 from extrap_train.store.digests import file_digest
 from extrap_train.store.manifest import claim
 from extrap_train.tasks.completion_results import Completed, write_completed
+from extrap_train.tasks.mirrored_inputs import mirror_inputs
 from extrap_train.tasks.scene_inputs import (
     open_sequence,
     require_space,
@@ -209,8 +205,10 @@ def _run(job: _Job, console: Console, watch: Watch | None) -> bool:
     if job.config.complete.dry_run:
         console.print(f"plan: {job.folder / 'plan.png'}; nothing was generated")
         return False
-    symmetries, mirrored = _mirror(job, start, console)
-    pipeline = pipeline.with_mirrored(mirrored)
+    symmetries: tuple[Symmetry, ...] = ()
+    if job.config.complete.symmetry and _is_generated(job.config):
+        symmetries, mirrored = mirror_inputs(start, job.photographs, console)
+        pipeline = pipeline.with_mirrored(mirrored)
     missing = _count_missing(scene_map, queries)
     require_space(job.folder, missing * view_bytes(pipeline.generator.warp_size))
     with _viewer(job, console) if watch is None else nullcontext(watch) as show:
@@ -272,26 +270,6 @@ def _start_map(job: _Job, pipeline: CompletionPipeline, console: Console) -> Glo
     for index, view in enumerate(scene_map.views):
         save_view(view, None, folder, index)
     return scene_map
-
-
-def _mirror(
-    job: _Job, inputs: GlobalMap, console: Console
-) -> tuple[tuple[Symmetry, ...], tuple[MapView, ...]]:
-    """The object's symmetries that the photographs confirm, and these mirrored."""
-    if not (job.config.complete.symmetry and _is_generated(job.config)):
-        return (), ()
-    size = inputs.views[0].camera.width
-    masks = [frame.load(depth=False).squared(size).mask for frame in job.photographs]
-    inputs = with_masks(inputs, masks)
-    found = find_symmetries(inputs)
-    for symmetry in found:
-        console.print(
-            f"symmetry: a plane maps {symmetry.agreement:.0%} of what is seen of the object onto "
-            f"what is seen, and {symmetry.gain:.0%} to where no photograph looks"
-        )
-    if not found:
-        console.print("symmetry: none that the photographs and their masks confirm")
-    return found, mirrored_photographs(inputs, found)
 
 
 def _map_options(config: TrainConfig) -> dict[str, Any]:
