@@ -21,6 +21,7 @@ from extrap_train.reconstruction.completion import (
     add_view,
     complete,
     map_of_inputs,
+    with_masks,
 )
 from extrap_train.reconstruction.global_map import GENERATED, GlobalMap, Prior, prior_of
 from extrap_train.reconstruction.map_files import load_map, save_view
@@ -180,9 +181,8 @@ def test_mirrored_photographs_show_what_is_behind_and_are_no_part_of_the_map():
     known = inputs(-30.0, 0.0, 30.0)
     masks = [(scenes.Scene(SCENE.shapes[:1]).depth(v.camera) > 0).float() for v in known.views]
     plane = MirrorPlane(torch.tensor([0.0, 0.0, 1.0]), torch.tensor(0.0))
-    mirrored = mirrored_photographs(
-        known, masks, [Symmetry(plane, torch.ones(()), torch.zeros(()))]
-    )
+    symmetry = Symmetry(plane, torch.ones(()), torch.zeros(()))
+    mirrored = mirrored_photographs(with_masks(known, masks), [symmetry])
     asked = []
 
     @dataclass(frozen=True)
