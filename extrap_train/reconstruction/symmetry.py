@@ -127,7 +127,8 @@ def _refined(coarse: Symmetry, points: Float[Tensor, "n 3"], inputs: GlobalMap) 
 
 def mirrored_photographs(inputs: GlobalMap, symmetries: Sequence[Symmetry]) -> tuple[MapView, ...]:
     """The map's views that have a mask in the mirrors, and of two mirrors also in one after the
-    other, with the depth of the object alone, and of that only what no view contradicts.
+    other, with the depth of the object alone, and of that only what no view shows or contradicts:
+    a photograph's own colours are surer.
     """
     objects = []
     for view in inputs.views:
@@ -144,8 +145,8 @@ def _mirrored(view: MapView, plane: MirrorPlane, inputs: GlobalMap) -> MapView:
     mirrored = mirrored_view(view.view, plane)
     assert mirrored.depth is not None
     points = unproject_to_world(mirrored.depth, mirrored.camera).flatten(0, 1)
-    empty = _sights(points, inputs, inputs.tolerance)[1].view_as(view.depth)
-    shown = (mirrored.depth > 0) & ~empty
+    seen, empty = _sights(points, inputs, inputs.tolerance).view(2, *view.depth.shape)
+    shown = (mirrored.depth > 0) & ~seen & ~empty
     return MapView(
         replace(mirrored, depth=torch.where(shown, mirrored.depth, 0)),
         torch.where(shown, MIRRORED_CONFIDENCE * view.confidence.flip(-1), 0),
