@@ -18,6 +18,7 @@ from extrap_train.data.record3d import find_metadata, read_record3d
 from extrap_train.data.sequences import FrameSequence
 from extrap_train.data.synthetic.capture import synthetic_sequence
 from extrap_train.data.transforms_json import TRANSFORMS, read_transforms
+from extrap_train.data.video_files import is_video
 from extrap_train.errors import InputError
 from extrap_train.views import stack_poses
 
@@ -57,6 +58,11 @@ def open_scene(
     if is_archive(path):
         return replace(_open_folder(unpack_archive(path), spec, poses), name=path.stem)
     if path.is_file():
+        if not is_video(path):
+            raise InputError(
+                f"scene {spec!r}: is not a video (MP4, MOV, AVI, Matroska or WebM), nor a .zip or "
+                f".r3d; if it belongs to a capture, give the folder: {path.absolute().parent}"
+            )
         return read_video(path, poses)
     if path.is_dir():
         return _open_folder(path, spec, poses)

@@ -21,18 +21,25 @@ _MATROSKA = b"\x1a\x45\xdf\xa3"
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 
+def is_video(path: Path) -> bool:
+    """Whether a file is, by its content, MP4, MOV, AVI, Matroska or WebM; no playlist is."""
+    try:
+        with require_file(path).open("rb") as file:
+            start = file.read(12)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the file") from None
+    is_avi = start[:4] == b"RIFF" and start[8:] == b"AVI "
+    return start[4:8] in _QUICKTIME_ATOMS or start[:4] == _MATROSKA or is_avi
+
+
 @contextmanager
 def open_video(path: Path) -> Iterator[cv2.VideoCapture]:
     """A video whose frames OpenCV decodes, turned as the file asks for.
 
-    InputError for files that are, by content, neither MP4, MOV, AVI, Matroska nor WebM, that
-    cannot be decoded, or whose frames have more than `MAX_PIXELS`: no playlist is followed.
+    InputError for files that are none (`is_video`), that cannot be decoded, or whose frames have
+    more than `MAX_PIXELS`.
     """
-    require_file(path)
-    with path.open("rb") as file:
-        start = file.read(12)
-    is_avi = start[:4] == b"RIFF" and start[8:] == b"AVI "
-    if not (start[4:8] in _QUICKTIME_ATOMS or start[:4] == _MATROSKA or is_avi):
+    if not is_video(path):
         raise InputError(
             f"{path}: is not a video (MP4, MOV, AVI, Matroska or WebM); restore or convert the file"
         )

@@ -1,5 +1,6 @@
 import pytest
 from captures import view_at, write_capture
+from complaints import complaint_of
 from posed_folders import write_transforms
 from test_colmap_model import Entry, write_binary
 
@@ -43,6 +44,12 @@ def test_what_is_no_scene(tmp_path, spec, expected):
         open_scene(spec.format(folder=tmp_path))
     assert expected in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["transforms.json", "cameras.xml", "1.jpg"])
+def test_a_file_of_a_capture_is_told_to_be_its_folder(tmp_path, name):
+    (tmp_path / name).write_text("{}")
+    assert str(tmp_path) in complaint_of(open_scene, str(tmp_path / name)).partition(";")[2]
 
 
 def test_a_model_without_pictures(tmp_path):
