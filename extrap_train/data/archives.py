@@ -63,6 +63,8 @@ def _open(path: Path) -> Iterator[ZipFile]:
     try:
         with ZipFile(path) as archive:
             yield archive
+    except OSError as error:
+        _refuse(path, f"cannot be read ({error.strerror}); check the file")
     except (BadZipFile, zlib.error, struct.error, EOFError, NotImplementedError, UnicodeError):
         _refuse(path, "is no zip archive, or a truncated or damaged one; export the capture again")
 
@@ -70,6 +72,7 @@ def _open(path: Path) -> Iterator[ZipFile]:
 def _members(archive: ZipFile, path: Path) -> dict[str, ZipInfo]:
     """The files to unpack by their paths, which are all below a folder and of a sane size."""
     members: dict[str, ZipInfo] = {}
+    length = path.stat().st_size
     for info in archive.infolist():
         listed = info.filename.replace("\\", "/")
         if listed.endswith("/") or listed.startswith("__MACOSX/"):
@@ -79,6 +82,8 @@ def _members(archive: ZipFile, path: Path) -> dict[str, ZipInfo]:
         if info.flag_bits & 1 or info.compress_type not in (ZIP_STORED, ZIP_DEFLATED):
             _refuse(path, f"{listed[:60]!a} is encrypted or not deflated; make a plain zip archive")
         name = posixpath.normpath(check_relative(listed, path))
+        if name == "." or not 0 <= info.header_offset < length:
+            raise BadZipFile
         if members.setdefault(name, info) is not info:
             _refuse(path, f"holds {name[:60]!a} twice; make the archive again")
     if len(members) > MAX_FILES:

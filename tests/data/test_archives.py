@@ -99,6 +99,7 @@ def typed(name, kind):
         ["a", "a/b"],
         ["a" * 300],
         ["bell\a"],
+        ["."],
     ],
     ids=str,
 )
@@ -142,6 +143,18 @@ def test_a_damaged_archive_leaves_nothing(tmp_path, cache, folder):
     assert not list(cache.glob(".*.tmp"))
     unpacked = {path for path in cache.glob("b-*") if path.is_dir()}
     assert all((path / "transforms.json").is_file() for path in unpacked)
+
+
+@pytest.mark.parametrize("offset", [1, 2**31, 2**32 - 2])
+def test_a_file_that_lies_nowhere_is_damage_and_no_full_disk(tmp_path, cache, offset):
+    """The offset of the only file, or of the list of files, from which the former is counted."""
+    content = pack_texts(tmp_path / "a.zip", ("a", "x")).read_bytes()
+    for place in (content.index(b"PK\x01\x02") + 42, content.index(b"PK\x05\x06") + 16):
+        damaged = content[:place] + offset.to_bytes(4, "little") + content[place + 4 :]
+        (tmp_path / "a.zip").write_bytes(damaged)
+        said = complaint_about(unpack_archive, tmp_path / "a.zip")
+        assert "damaged" in said
+        assert "XDG_CACHE_HOME" not in said
 
 
 def refusal(archive, content):
