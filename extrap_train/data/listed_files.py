@@ -18,6 +18,7 @@ _MAX_COMPARED = 2000
 """Names of a folder that a missing one is compared with."""
 _IMAGES = re.compile(r"images(_\d+)?")
 """Folders of pictures, whole or reduced, that masks lie beside."""
+_NUMBER = re.compile("([0-9]+)")
 _MASK_ENDINGS = tuple(f"_mask{suffix}" for suffix in PICTURE_SUFFIXES)
 
 log = logging.getLogger(__name__)
@@ -174,6 +175,12 @@ def _masks(folder: str) -> str:
 def normal_path(listed: str) -> str:
     """The same for paths that differ in strokes and detours alone."""
     return posixpath.normpath(listed.replace("\\", "/"))
+
+
+def counting_order(path: str) -> tuple[list[str | int], str]:
+    """A key by which paths are sorted in the order of the numbers in them: `2.jpg`, `10.jpg`."""
+    parts = _NUMBER.split(path)  # texts and numbers take turns
+    return [int(part) if place % 2 else part for place, part in enumerate(parts)], path
 
 
 def _folded(name: str) -> str:

@@ -21,6 +21,7 @@ from extrap_train.data.listed_files import (
     PICTURE_SUFFIXES,
     ListedFiles,
     MaskFiles,
+    counting_order,
     normal_path,
 )
 from extrap_train.data.sequences import NO_CATEGORY, FrameSequence, Photograph, PointFile
@@ -71,7 +72,7 @@ def sequence_of_photographs(
     unusable: Sequence[str],
     point_cloud: PointFile | None = None,
 ) -> FrameSequence:
-    """A sequence of the photographs below `files.root`, in the order of their paths.
+    """A sequence of the photographs below `files.root`, in the `counting_order` of their paths.
 
     `description` is the file that lists them; masks that it does not name are found by `MaskFiles`.
     `unusable` holds the reasons why further entries name no picture. Entries without a picture, and
@@ -220,7 +221,7 @@ def _find_pictures(
         log.warning("%s", fault)
     if twice := [path for path in found if len(entries[path]) > 1]:
         log.warning("%s: lists %d pictures twice (%s)", description, len(twice), twice[0])
-    return sorted(entries.items())
+    return sorted(entries.items(), key=lambda entry: counting_order(entry[0]))
 
 
 def _describe(path: str, entries: Sequence[Listed], description: Path) -> ListedPhotograph:

@@ -68,6 +68,15 @@ def test_an_archive_and_an_exported_sequence(tmp_path, capture, monkeypatch, cap
     assert ".r3d" in caplog.text
 
 
+def test_frames_are_in_the_order_of_their_numbers(capture):
+    poses = json.loads((capture / "metadata").read_text())["poses"]
+    for index in range(len(SHOTS), 12):
+        save_picture(capture / f"rgbd/{index}.jpg", seed=index)
+    write_metadata(capture, poses=poses * 4)
+    names = [frame.name for frame in open_scene(str(capture)).frames]
+    assert names == [f"{index}.jpg" for index in range(12)]
+
+
 def test_a_frame_has_its_own_lens(capture):
     write_metadata(capture, perFrameIntrinsicCoeffs=[[60 + i, 61, 20, 15] for i in range(3)])
     focal = [frame.camera.intrinsics[0, 0].item() for frame in open_scene(str(capture)).frames]
