@@ -128,6 +128,11 @@ def _panorama(entry: dict[str, Any], height: int, width: int) -> Equirectangular
                 f"{key} is {entry[key]!r}, and that of a panorama of this size is {wanted[key]:g}: "
                 "remove it"
             )
+    for key in ("is_fisheye", *sorted(_PLACE_KEYS - wanted.keys())):
+        if _says_something(entry.get(key)):
+            raise ValueError(
+                f"{key} is {entry[key]!r:.60}, which a panorama does not have: remove it"
+            )
     coefficients = _coefficients(entry, fisheye=True)
     _require_zero(coefficients, _COEFFICIENTS, f"camera_model {PANORAMA}")
     return Equirectangular()

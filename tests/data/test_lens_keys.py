@@ -11,6 +11,7 @@ from extrap_train.geometry.lens import Lens, distort
 
 HEIGHT, WIDTH = 96, 128
 PINHOLE = {"fl_x": 80, "fl_y": 81, "cx": 60, "cy": 50}
+WHOLE = {"fl_x": WIDTH / 2, "fl_y": HEIGHT, "cx": WIDTH / 2, "cy": HEIGHT / 2}
 RADIAL = {"k1": -0.2, "k2": 0.12, "k3": -0.1, "k4": 0.2}
 
 
@@ -92,6 +93,10 @@ def test_four_coefficients_are_those_of_a_fisheye_or_have_no_more_than_two_terms
     ("keys", "named"),
     [
         ({"camera_model": "EQUIRECTANGULAR"}, "fl_x|fl_y|cx|cy"),
+        *(
+            ({"camera_model": "EQUIRECTANGULAR", **WHOLE, key: value}, key)
+            for key, value in (("is_fisheye", True), ("x_fov", 90), ("camera_angle_x", 1.5))
+        ),
         ({"camera_model": "EQUIRECTANGULAR", "fl_x": 64, "fl_y": 96, "cx": 64, "cy": 40}, "cy"),
         ({"camera_model": "FISHEYE624"}, "FISHEYE624"),
         ({"camera_model": ["OPENCV"]}, "camera_model"),
@@ -122,7 +127,7 @@ def test_what_cannot_be_undone_is_named(keys, named):
 
 
 def test_a_panorama_as_nerfstudio_writes_it():
-    said = {"fl_x": WIDTH / 2, "fl_y": HEIGHT, "cx": WIDTH / 2, "cy": HEIGHT / 2, "k1": 0}
+    said = WHOLE | {"k1": 0}
     assert lens(camera_model="EQUIRECTANGULAR", **said) == Equirectangular()
     with pytest.raises(ValueError, match="k1"):
         lens(camera_model="EQUIRECTANGULAR", **(said | {"k1": 0.1}))
