@@ -44,6 +44,8 @@ def read_realitycapture(table: Path, name: str) -> FrameSequence:
         raise InputError(
             f"{table}: has no {', '.join(missing)}; export `Internal/External camera parameters`"
         )
+    if twice := [column for column in _REQUIRED if columns.count(column) > 1]:
+        raise InputError(f"{table}: has more than one column {twice[0]}; remove the wrong one")
     try:
         rows = [row for row in csv.reader(lines[1:]) if row]
     except csv.Error as error:

@@ -138,6 +138,7 @@ def test_a_row_that_cannot_be_used_is_left_out(tmp_path, caplog, changes):
         ",".join(COLUMNS) + "\n1,2,3",
         ",".join(COLUMNS) + '\na.png,"' + "x" * 200_000,
         "#name,x,x,y,alt,heading,pitch,roll,f\na.png",
+        "#name,x,x,y,alt,heading,pitch,roll,f\na.png,1,2,3,4,0,0,0,50",
         "#name,x,y,alt\na.png,1,2,3",
     ],
     ids=lambda text: text[:70],
