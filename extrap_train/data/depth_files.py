@@ -88,6 +88,15 @@ class DepthFile:
         return torch.from_numpy(depth)
 
 
+def find_depth(root: Path, depth: str, scale: float, confidence: str) -> DepthFile | None:
+    """A frame's depth by its path below the root, trusted where `confidence` is not 0 if that file
+    is there; None where there is no depth.
+    """
+    if not (root / depth).exists():
+        return None
+    return DepthFile(depth, scale, confidence if (root / confidence).exists() else None)
+
+
 def _read_trust(path: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "h w"]:
     if path.suffix == CONFIDENCE_SUFFIX:
         return nearest_pixels(read_lzfse_array(path, size, ("u1",)), size)

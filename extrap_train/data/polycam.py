@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from extrap_train.data.camera_check import OPENGL_POSES
-from extrap_train.data.depth_files import DepthFile
+from extrap_train.data.depth_files import DepthFile, find_depth
 from extrap_train.data.json_files import read_json, require_dict
 from extrap_train.data.lens_keys import number_of
 from extrap_train.data.listed_files import ListedFiles
@@ -78,6 +78,4 @@ def _photograph(root: Path, file: Path, path: str) -> ListedPhotograph:
 
 def _depth(root: Path, stem: str) -> DepthFile | None:
     depth, confidence = (f"{KEYFRAMES}/{kind}/{stem}.png" for kind in ("depth", "confidence"))
-    if not (root / depth).exists():
-        return None
-    return DepthFile(depth, MILLIMETRES, confidence if (root / confidence).exists() else None)
+    return find_depth(root, depth, MILLIMETRES, confidence)

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from extrap_train.data.camera_check import OPENGL_POSES
-from extrap_train.data.depth_files import DepthFile
+from extrap_train.data.depth_files import DepthFile, find_depth
 from extrap_train.data.json_files import read_json, require_dict
 from extrap_train.data.listed_files import ListedFiles
 from extrap_train.data.listed_photographs import (
@@ -106,6 +106,4 @@ def _lens(content: dict[str, Any], index: int) -> dict[str, Any]:
 
 def _depth(root: Path, index: int) -> DepthFile | None:
     depth, confidence = (f"rgbd/{index}{suffix}" for suffix in (DEPTH_SUFFIX, CONFIDENCE_SUFFIX))
-    if not (root / depth).exists():
-        return None
-    return DepthFile(depth, 1.0, confidence if (root / confidence).exists() else None)
+    return find_depth(root, depth, 1.0, confidence)
