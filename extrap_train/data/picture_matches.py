@@ -35,8 +35,8 @@ def write_matches(matcher: Matcher, folder: Path, files: Sequence[str]) -> None:
         for i, j in pairs:
             matches = match(i, j)
             places.append((len(points[i]), len(points[j])))
-            points[i].append(matches.first.double().numpy(force=True))
-            points[j].append(matches.second.double().numpy(force=True))
+            points[i].append(matches.first.float().numpy(force=True))
+            points[j].append(matches.second.float().numpy(force=True))
             confidences.append(matches.confidence.numpy(force=True))
             bar.advance()
     merged = [merge_points(found) for found in points]
@@ -45,7 +45,7 @@ def write_matches(matcher: Matcher, folder: Path, files: Sequence[str]) -> None:
         indices = np.stack([merged[i][1][at_i], merged[j][1][at_j]], 1)
         if len(indices):
             arrays[f"{files[i]} {files[j]}"] = keep_best(indices, confidence)
-    np.savez(folder / MATCHES, allow_pickle=False, **arrays)
+    np.savez(folder / MATCHES, **arrays)
 
 
 def _matching(matcher: Matcher, paths: Sequence[Path]) -> Callable[[int, int], Matches]:
