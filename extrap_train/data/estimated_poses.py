@@ -25,15 +25,18 @@ from extrap_train.config import MatcherConfig, SiftPosesConfig
 from extrap_train.data.camera_check import LONGEST_FOCAL, SHORTEST_FOCAL
 from extrap_train.data.colmap import read_model, read_model_cameras
 from extrap_train.data.image_files import read_photograph, to_eight_bits, upright_photograph
-from extrap_train.data.listed_files import PICTURE_SUFFIXES, is_mask_name
+from extrap_train.data.listed_files import PICTURE_SUFFIXES, counting_order, is_mask_name
 from extrap_train.data.paths import require_file
-from extrap_train.data.picture_matches import write_matches
+from extrap_train.data.picture_matches import CELL, write_matches
 from extrap_train.data.sequences import FrameSequence
 from extrap_train.data.structure_from_motion import (
+    CLEARLY_BETTER,
     ESTIMATE,
+    EXHAUSTIVE,
     MAX_FEATURES,
     MAX_SIDE,
     MIN_PICTURES,
+    NEIGHBOURS,
     SEED,
     SharedCamera,
     count_steps,
@@ -63,7 +66,8 @@ def find_pictures(folder: Path) -> list[str]:
         return []
     paths = (path for path in folder.iterdir() if path.suffix.lower() in PHOTOGRAPH_SUFFIXES)
     files = (path for path in paths if path.is_file() or path.is_symlink())  # broken ones are named
-    names = sorted(path.name for path in files if not path.name.startswith("."))
+    visible = (path.name for path in files if not path.name.startswith("."))
+    names = sorted(visible, key=counting_order)
     return [name for name in names if not is_mask_name(name, names)]
 
 
@@ -83,7 +87,8 @@ def read_unposed(
         )
     pictures, poses = _select_present(folder, pictures), poses or SiftPosesConfig()
     settings = {
-        **{"max_side": MAX_SIDE, "max_features": MAX_FEATURES, "seed": SEED},
+        **{"max_side": MAX_SIDE, "max_features": MAX_FEATURES, "seed": SEED, "cell": CELL},
+        **{"pairs": [EXHAUSTIVE, NEIGHBOURS], "clearly_better": CLEARLY_BETTER},
         "matcher": {key: value for key, value in asdict(poses).items() if key != "checkpoint"},
         "weights": [file_digest(file) for file in weight_files(poses) if file.is_file()],
     }

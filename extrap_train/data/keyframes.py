@@ -55,7 +55,10 @@ def read_video(file: Path, poses: MatcherConfig | None = None) -> FrameSequence:
     InputError where the file is no video, shows fewer than three distinct views, or its cameras
     cannot be estimated.
     """
-    settings = [MAX_CHOSEN, MOVED, BLURRED, NEARBY, _SIDE]
+    settings = [
+        *(MAX_CHOSEN, MOVED, BLURRED, NEARBY, _SIDE, _MAX_FEATURES, _MIN_FEATURES),
+        *(_FEATURE_QUALITY, _FEATURE_DISTANCE, _MAX_BACKWARD_ERROR, _JPEG_QUALITY),
+    ]
     content = json.dumps([settings, file_digest(file)])
     stored = cache_entry("videos", file.stem, hashlib.sha256(content.encode()).hexdigest())
     is_sound = partial(is_sealed, part="images")
