@@ -6,6 +6,7 @@ that lie in one cell of a grid become one keypoint, so that tracks form through 
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -40,7 +41,8 @@ def write_matches(matcher: Matcher, folder: Path, files: Sequence[str]) -> None:
             confidences.append(matches.confidence.numpy(force=True))
             bar.advance()
     merged = [merge_points(found) for found in points]
-    arrays = {file: keypoints for file, (keypoints, _) in zip(files, merged, strict=True)}
+    # Any: NumPy since 2.2 has a keyword of type bool, which its older versions take for an array.
+    arrays: dict[str, Any] = {f: keypoints for f, (keypoints, _) in zip(files, merged, strict=True)}
     for (i, j), (at_i, at_j), confidence in zip(pairs, places, confidences, strict=True):
         indices = np.stack([merged[i][1][at_i], merged[j][1][at_j]], 1)
         if len(indices):
