@@ -56,12 +56,12 @@ class CompletionPipeline:
     predictor: DepthPredictor | None = None
     """Predicts the generated views' depth instead of `source`."""
     mirrored: tuple[MapView, ...] = ()
-    """Photographs in the object's plane of symmetry, which new views are made from and aligned to
-    as to the photographs; they are never part of the map.
+    """Photographs mirrored in the object's planes of symmetry. New views are made from them and
+    aligned to them as to the photographs, but they are never part of the map.
     """
 
     def with_mirrored(self, mirrored: Sequence[MapView]) -> "CompletionPipeline":
-        """With mirrored photographs, and a generator that takes as many views again as without."""
+        """With mirrored photographs, and with a diffusion model that takes twice as many views."""
         generator = self.generator
         if mirrored and isinstance(generator, DiffusionGenerator):
             most = generator.references or generator.model.config.num_condition_views
@@ -84,7 +84,7 @@ def map_of_inputs(
 
 
 def with_masks(scene_map: GlobalMap, masks: Sequence[Float[Tensor, "h w"] | None]) -> GlobalMap:
-    """The map with the object's mask in each of its views, which it is not kept with on disk."""
+    """The map with the object's mask in each of its views; on disk, views have no masks."""
     pairs = zip(scene_map.views, masks, strict=True)
     views = (replace(view, view=replace(view.view, mask=mask)) for view, mask in pairs)
     return replace(scene_map, views=tuple(views))

@@ -38,7 +38,9 @@ class Lookup:
     sight: Int[Tensor, " n"]
     """A `Sight`."""
     pixel: Int[Tensor, " n"]
-    """Index of the pixel that the point falls into; 0 where unseen."""
+    """Index of the pixel that the point falls into; 0 outside the picture."""
+    inside: Bool[Tensor, " n"]
+    """Whether the point falls into the picture, with a known depth there or not."""
     depth: Float[Tensor, " n"]
     """The point's own, in the view's camera."""
 
@@ -62,7 +64,7 @@ def look_up(
     agrees = torch.stack([(z / d.clamp(min=1e-30) - 1).abs() for d in (own, near, far)]).amin(0)
     sight = torch.where(z < near * (1 - tolerance), Sight.IN_FRONT, Sight.HIDDEN)
     sight = torch.where(agrees <= tolerance, Sight.AGREES, sight)
-    return Lookup(torch.where(known, sight, Sight.UNSEEN), index, z)
+    return Lookup(torch.where(known, sight, Sight.UNSEEN), index, inside, z)
 
 
 def _range_around(

@@ -90,7 +90,8 @@ def find_symmetries(inputs: GlobalMap) -> tuple[Symmetry, ...]:
     """The object's planes of symmetry that add most to what the photographs show, at most two, the
     best first; none if none is believed, as where no view has a mask of the object.
 
-    Planes stand within 20° of the axis that the cameras circle, and the two more than 50° apart.
+    Planes stand within about 25° of the axis that the cameras circle, and the two about 50° or more
+    apart.
     The same input gives the same planes.
     """
     points = _object_points(inputs)
@@ -228,9 +229,9 @@ def _weigh(
 def _sights(
     points: Float[Tensor, "n 3"], inputs: GlobalMap, tolerance: float
 ) -> Bool[Tensor, "2 n"]:
-    """Which points of the object some view contradicts (the second row), as it has seen that they
-    are empty or has no object in that pixel, and which of the others lie on a surface that some
-    view shows (the first).
+    """Which points of the object some view contradicts (the second row): it has seen through them,
+    or they lie outside the object's mask, whatever its depth there. Which of the others lie on a
+    surface that some view shows (the first row).
     """
     agrees, empty = torch.zeros(2, len(points), dtype=torch.bool)
     for view in inputs.views:
@@ -240,5 +241,5 @@ def _sights(
         empty |= (found.sight == Sight.IN_FRONT) & is_measured
         if view.view.mask is not None:
             is_object = _outer(view.view.mask).flatten()[found.pixel]
-            empty |= (found.sight != Sight.UNSEEN) & ~is_object
+            empty |= found.inside & ~is_object
     return torch.stack([agrees & ~empty, empty])

@@ -1,13 +1,19 @@
 """The plane of symmetry is the object's own; where it has none, or shows none, there is none."""
 
+from dataclasses import replace
+from functools import partial
+
 import pytest
 import scenes
 import torch
+from rich.console import Console
 
+from extrap_train.data.sequences import Frame
 from extrap_train.geometry.cameras import unproject_to_world
 from extrap_train.reconstruction.completion import map_of_inputs, with_masks
 from extrap_train.reconstruction.global_map import Sight, look_up
 from extrap_train.reconstruction.symmetry import MIRRORED, find_symmetries, mirrored_photographs
+from extrap_train.tasks.mirrored_inputs import mirror_inputs
 from extrap_train.views import View
 
 SIZE = 64
@@ -75,6 +81,31 @@ def test_what_a_photograph_shows_is_not_mirrored(dumbbell):
 
 def test_a_heap_without_symmetry_has_none():
     assert find_symmetries(photographed(HEAP, 35.0, 55.0, 75.0)) == ()
+
+
+def test_without_depth_beside_the_object_its_outline_still_speaks_against_planes():
+    known = photographed(HEAP, 35.0, 55.0, 75.0)
+    views = []
+    for view in known.views:
+        shown = view.view.mask > 0.5
+        depth, confidence = (torch.where(shown, x, 0) for x in (view.depth, view.confidence))
+        views.append(replace(view, view=replace(view.view, depth=depth), confidence=confidence))
+    assert find_symmetries(replace(known, views=tuple(views))) == ()
+
+
+@pytest.mark.parametrize("mask", [None, torch.ones(SIZE, SIZE)], ids=["none", "whole picture"])
+def test_without_the_objects_outline_no_symmetry_is_sought(mask):
+    """The flat ground is symmetric in every upright plane."""
+    known = photographed(HEAP, 35.0, 55.0, 75.0)
+
+    def masked(view, depth):
+        return replace(view.view, mask=mask)
+
+    frames = [
+        Frame(view.view.name, view.camera, False, True, partial(masked, view), ())
+        for view in known.views
+    ]
+    assert mirror_inputs(known, frames, Console(quiet=True)) == ((), ())
 
 
 def test_without_an_object_there_is_none(dumbbell):
