@@ -91,8 +91,7 @@ def find_symmetries(inputs: GlobalMap) -> tuple[Symmetry, ...]:
     best first; none if none is believed, as where no view has a mask of the object.
 
     Planes stand within about 25° of the axis that the cameras circle, and the two about 50° or more
-    apart.
-    The same input gives the same planes.
+    apart. The same input gives the same planes.
     """
     points = _object_points(inputs)
     if len(points) < _COARSE_POINTS:
