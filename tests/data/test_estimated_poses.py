@@ -204,7 +204,7 @@ def test_a_failing_process_is_one_line(tmp_path, monkeypatch):
     "file",
     [
         "sparse/0/cameras.bin",
-        "colmap/sparse/0/images.txt",
+        "colmap/sparse/0/cameras.txt",
         "Transforms.json",
         "poses_bounds.npy",
         "../frame_annotations.jgz",
