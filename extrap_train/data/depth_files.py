@@ -50,9 +50,9 @@ class DepthFile:
     def read(self, root: Path, size: tuple[int, int]) -> Float[Tensor, "h w"]:
         """The depth in scene units at `size` (height, width); 0 where unknown or not trusted.
 
-        A greyscale picture of 16 bits, whose largest value is none, a TIFF of 32, an NPY array, or
-        a file of Record3D's, of the shape of `size`: it is resampled from the nearest pixels. An
-        empty map, and a scale that cannot be, is an error.
+        Reads a greyscale picture of 16 bits (its largest value means unknown), a TIFF of 32 bits,
+        an NPY array, or a file of Record3D's. The map must have the aspect ratio of `size` and is
+        resampled from the nearest pixels. An empty map and an impossible scale are errors.
         """
         path = root / self.path
         if self.is_half_float:

@@ -45,7 +45,7 @@ from extrap_train.data.structure_from_motion import (
 from extrap_train.depth.sources import weight_files
 from extrap_train.errors import InputError
 from extrap_train.matching.matchers import matcher
-from extrap_train.store.cache import cache_entry, fill_entry, is_sealed, seal
+from extrap_train.store.cache import cache_entry, fill_entry, is_intact, seal
 from extrap_train.store.digests import file_digest
 from extrap_train.terminal import progress
 
@@ -94,7 +94,7 @@ def read_unposed(
     }
     content = json.dumps([settings, {p: file_digest(folder / p) for p in sorted(pictures)}])
     stored = cache_entry("poses", name, hashlib.sha256(content.encode()).hexdigest())
-    is_sound = partial(is_sealed, part="sparse")
+    is_sound = partial(is_intact, part="sparse")
     if not is_sound(stored):
         with fill_entry(stored, is_sound, "estimated cameras") as made:
             _estimate(folder, pictures, poses, made)

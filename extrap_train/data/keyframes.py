@@ -23,7 +23,7 @@ from extrap_train.data.sequences import FrameSequence
 from extrap_train.data.structure_from_motion import MIN_PICTURES
 from extrap_train.data.video_files import frame_size, open_video
 from extrap_train.errors import InputError
-from extrap_train.store.cache import cache_entry, fill_entry, is_sealed, seal
+from extrap_train.store.cache import cache_entry, fill_entry, is_intact, seal
 from extrap_train.store.digests import file_digest
 from extrap_train.terminal import track
 
@@ -61,7 +61,7 @@ def read_video(file: Path, poses: MatcherConfig | None = None) -> FrameSequence:
     ]
     content = json.dumps([settings, file_digest(file)])
     stored = cache_entry("videos", file.stem, hashlib.sha256(content.encode()).hexdigest())
-    is_sound = partial(is_sealed, part="images")
+    is_sound = partial(is_intact, part="images")
     if not is_sound(stored):
         with fill_entry(stored, is_sound, "frames of a video") as made:
             _write_chosen(file, made)

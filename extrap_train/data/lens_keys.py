@@ -75,7 +75,7 @@ def merge_entry(common: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]
 
 
 def _keys_of_other_lens(common: dict[str, Any], frame: dict[str, Any]) -> set[str]:
-    """Those of all frames that say nothing of one whose lens is named to be another."""
+    """The keys shared by all frames that do not apply to a frame that names another lens."""
     own, shared = frame.get("camera_model"), common.get("camera_model")
     names_model = own is not None and shared is not None and own != shared
     fisheyes = [_says_fisheye(entry) for entry in (common, frame)]

@@ -82,6 +82,16 @@ class Matcher(Protocol):
 class SeparableMatcher(Matcher, Protocol):
     """A matcher that looks at each picture by itself first, which many pairs can share."""
 
+    def match(
+        self,
+        first: Float[Tensor, "3 h w"],
+        second: Float[Tensor, "3 h2 w2"],
+        first_known: Bool[Tensor, "h w"] | None = None,
+    ) -> Matches:
+        """See `Matcher.match`; on the device of `first`."""
+        matches = self.match_described(self.describe(first), self.describe(second)).to(first)
+        return matches if first_known is None else matches[is_known_at(first_known, matches.first)]
+
     def describe(self, image: Float[Tensor, "3 h w"]) -> Any:
         """What `match_described` needs of one picture."""
         ...

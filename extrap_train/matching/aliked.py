@@ -4,12 +4,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from kornia.feature import ALIKED, match_smnn
 from torch import Tensor
 
 from extrap_train.config import AlikedMatcherConfig
-from extrap_train.matching import Matches, is_known_at, resize, to_image_pixels
+from extrap_train.matching import Matches, SeparableMatcher, resize, to_image_pixels
 from extrap_train.weight_files import WeightFile
 
 MAX_RATIO = 0.9
@@ -17,11 +17,11 @@ MAX_RATIO = 0.9
 CONSTANTS = ("dkd.hw_grid",)
 """The detector's constants: part of its state, but not of the published file."""
 
-Described = tuple[Float[Tensor, "_ 2"], Float[Tensor, "_ d"]]
+DescribedKeypoints = tuple[Float[Tensor, "_ 2"], Float[Tensor, "_ d"]]
 
 
 @dataclass(frozen=True)
-class AlikedMatcher:
+class AlikedMatcher(SeparableMatcher):
     """Works across wide baselines where there is texture.
 
     Confidence is 1 minus the ratio of the nearest descriptor's distance to the second one's.
@@ -30,24 +30,14 @@ class AlikedMatcher:
     config: AlikedMatcherConfig
     network: ALIKED = field(repr=False, compare=False)
 
-    def match(
-        self,
-        first: Float[Tensor, "3 h w"],
-        second: Float[Tensor, "3 h2 w2"],
-        first_known: Bool[Tensor, "h w"] | None = None,
-    ) -> Matches:
-        """Matches that are unique in both pictures; on the device of `first`."""
-        matches = self.match_described(self.describe(first), self.describe(second)).to(first)
-        return matches if first_known is None else matches[is_known_at(first_known, matches.first)]
-
-    def match_described(self, first: Described, second: Described) -> Matches:
-        """Matches between the keypoints of two pictures, on the network's device."""
+    def match_described(self, first: DescribedKeypoints, second: DescribedKeypoints) -> Matches:
+        """Matches that are unique among the keypoints of both, on the network's device."""
         (points, descriptors), (others, other_descriptors) = first, second
         ratios, pairs = match_smnn(descriptors, other_descriptors, MAX_RATIO)
         return Matches(points[pairs[:, 0]], others[pairs[:, 1]], 1 - ratios[:, 0])
 
     @torch.no_grad()
-    def describe(self, image: Float[Tensor, "3 h w"]) -> Described:
+    def describe(self, image: Float[Tensor, "3 h w"]) -> DescribedKeypoints:
         """Keypoints in the picture's pixels, and their descriptors."""
         scale = min(1.0, self.config.image_size / max(image.shape[1:]))
         height, width = (max(1, round(side * scale)) for side in image.shape[1:])

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from extrap_train.config import Mast3rMatcherConfig
@@ -12,7 +12,7 @@ from extrap_train.depth.mast3r.network.crop import crop_for, network_input
 from extrap_train.depth.mast3r.network.mast3r_checkpoint import read_network
 from extrap_train.depth.mast3r.network.point_map_network import Encoding, PointMapNetwork
 from extrap_train.errors import InputError
-from extrap_train.matching import Matches, is_known_at
+from extrap_train.matching import Matches, SeparableMatcher
 from extrap_train.views import Camera, View
 
 STEP = 8
@@ -24,7 +24,7 @@ _ROWS = 512
 
 
 @dataclass(frozen=True)
-class Described:
+class EncodedPicture:
     """One picture's tokens, and the affine map from its pixels to the network's."""
 
     encoding: Encoding
@@ -32,7 +32,7 @@ class Described:
 
 
 @dataclass(frozen=True)
-class Mast3rMatcher:
+class Mast3rMatcher(SeparableMatcher):
     """Finds matches across wide baselines and in weak texture, at most one per 8 × 8 pixels.
 
     Nothing is matched outside the middle of a picture that the network does not see whole: a square
@@ -44,19 +44,9 @@ class Mast3rMatcher:
     network: PointMapNetwork = field(repr=False, compare=False)
     option: str = "matcher"
 
-    def match(
-        self,
-        first: Float[Tensor, "3 h w"],
-        second: Float[Tensor, "3 h2 w2"],
-        first_known: Bool[Tensor, "h w"] | None = None,
-    ) -> Matches:
-        """Pixels that are each other's nearest by descriptor; on the device of `first`."""
-        matches = self.match_described(self.describe(first), self.describe(second)).to(first)
-        return matches if first_known is None else matches[is_known_at(first_known, matches.first)]
-
     @torch.no_grad()
-    def match_described(self, first: Described, second: Described) -> Matches:
-        """Matches between two pictures, on the network's device."""
+    def match_described(self, first: EncodedPicture, second: EncodedPicture) -> Matches:
+        """Pixels that are each other's nearest by descriptor, on the network's device."""
         here, there = self.network.describe(first.encoding, second.encoding)
         ones, twos = find_reciprocal(here.descriptors[0], there.descriptors[0])
         sure = (here.confidence.flatten()[ones] * there.confidence.flatten()[twos]).sqrt()
@@ -68,7 +58,7 @@ class Mast3rMatcher:
         )
 
     @torch.no_grad()
-    def describe(self, image: Float[Tensor, "3 h w"]) -> Described:
+    def describe(self, image: Float[Tensor, "3 h w"]) -> EncodedPicture:
         """The picture as the network's encoder sees it, cropped to the shapes that it knows."""
         height, width = image.shape[1:]
         # Intrinsics of 1 follow resampling and crop as pixels do.
@@ -79,7 +69,7 @@ class Mast3rMatcher:
         crop = crop_for(view, self.config.image_size, patch, square=False, option=self.option)
         small = crop.apply(view)
         encoding = self.network.encode(network_input(small, device))
-        return Described(encoding, small.camera.intrinsics.to(device))
+        return EncodedPicture(encoding, small.camera.intrinsics.to(device))
 
 
 def find_reciprocal(

@@ -119,7 +119,7 @@ def add_view(
     """
     options, clock = pipeline.options, _Clock()
     known = pipeline.guided(scene_map)
-    references = _references(scene_map, query, pipeline)
+    references = _references(scene_map, known, query, pipeline.options)
     neighbours = known.nearest(query.camera, options.edges)
     tries = options.confidence.attempts if options.confidence.regenerate else 1
     best: tuple[Proposal, int] | None = None
@@ -163,14 +163,15 @@ def add_view(
     return scene_map, added, step
 
 
-def _references(scene_map: GlobalMap, query: Query, pipeline: CompletionPipeline) -> list[int]:
-    """Indices, in the guided map, of what a view is generated from, nearest first.
+def _references(
+    scene_map: GlobalMap, known: GlobalMap, query: Query, options: CompletionConfig
+) -> list[int]:
+    """Indices, in the guided map `known`, of what a view is generated from, nearest first.
 
     Mirrored photographs show the object alone and come in addition: what lies around it is seen
     from the others.
     """
-    known = pipeline.guided(scene_map)
-    only_photographs = pipeline.options.references == "photographs"
+    only_photographs = options.references == "photographs"
     own = scene_map.nearest(query.camera, REFERENCES, photographs=only_photographs)
     order = known.nearest(query.camera, len(known))
     mirrored = [index for index in order if index >= len(scene_map)][:REFERENCES]

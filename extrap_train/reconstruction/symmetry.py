@@ -1,8 +1,9 @@
 """The object's planes of symmetry, and the photographs mirrored in them.
 
 Most objects have one: what the photographs show of one side says what the other side looks like.
-A plane is believed if it maps what they show onto what they show, and onto nothing that they have
-seen to be empty. (Thrun and Wegbreit, Shape from symmetry, 2005, weigh the same evidence.)
+A plane is believed if it maps what they show onto what they show, and neither into space that they
+have seen to be empty nor out of the object's outline. (Thrun and Wegbreit, Shape from symmetry,
+2005, weigh the same evidence.)
 """
 
 from collections.abc import Sequence
@@ -21,13 +22,13 @@ from extrap_train.reconstruction.global_map import GlobalMap, MapView, Origin, S
 
 MIRRORED = "mirrored"
 """Kind of a mirrored photograph; none is ever part of a map."""
-MIRRORED_CONFIDENCE = 0.5
+_MIRRORED_CONFIDENCE = 0.5
 """Factor on a photograph's confidence: what it shows is only likely to be on the other side."""
-MIN_AGREEMENT = 0.25
+_MIN_AGREEMENT = 0.25
 """Share of the object's mirrored points that must lie on surfaces that the photographs show."""
-MAX_CONTRADICTION = 0.03
-"""Share of them that may lie where a photograph shows empty space."""
-MIN_GAIN = 0.1
+_MAX_CONTRADICTION = 0.03
+"""Share of them that may lie where a photograph shows empty space, or no object."""
+_MIN_GAIN = 0.1
 """Share of them that must lie where no photograph looks: else there is nothing to add."""
 _RELIABLE = 0.3
 """Confidence of the depths that symmetry is sought in."""
@@ -71,8 +72,8 @@ class Symmetry:
     @property
     def is_believed(self) -> Bool[Tensor, "*b"]:
         """Whether the evidence suffices, and something is added."""
-        is_known = (self.agreement >= MIN_AGREEMENT) & (self.contradiction <= MAX_CONTRADICTION)
-        return is_known & (self.gain >= MIN_GAIN)
+        is_known = (self.agreement >= _MIN_AGREEMENT) & (self.contradiction <= _MAX_CONTRADICTION)
+        return is_known & (self.gain >= _MIN_GAIN)
 
     @property
     def merit(self) -> Float[Tensor, "*b"]:
@@ -126,8 +127,8 @@ def _refined(coarse: Symmetry, points: Float[Tensor, "n 3"], inputs: GlobalMap) 
 
 
 def mirrored_photographs(inputs: GlobalMap, symmetries: Sequence[Symmetry]) -> tuple[MapView, ...]:
-    """The map's views that have a mask in the mirrors, and of two mirrors also in one after the
-    other, with the depth of the object alone, and of that only what no view shows or contradicts:
+    """The map's views that have a mask, as each mirror shows them, and as the second shows what the
+    first does. Their depth is the object's alone, and only where no view shows or contradicts it:
     a photograph's own colours are surer.
     """
     objects = []
@@ -149,7 +150,7 @@ def _mirrored(view: MapView, plane: MirrorPlane, inputs: GlobalMap) -> MapView:
     shown = (mirrored.depth > 0) & ~seen & ~empty
     return MapView(
         replace(mirrored, depth=torch.where(shown, mirrored.depth, 0)),
-        torch.where(shown, MIRRORED_CONFIDENCE * view.confidence.flip(-1), 0),
+        torch.where(shown, _MIRRORED_CONFIDENCE * view.confidence.flip(-1), 0),
         torch.zeros_like(shown),
         Origin(MIRRORED, root=view.origin.root),
     )
@@ -228,9 +229,9 @@ def _weigh(
 def _sights(
     points: Float[Tensor, "n 3"], inputs: GlobalMap, tolerance: float
 ) -> Bool[Tensor, "2 n"]:
-    """Which points of the object some view contradicts (the second row): it has seen through them,
-    or they lie outside the object's mask, whatever its depth there. Which of the others lie on a
-    surface that some view shows (the first row).
+    """First row: which points of the object lie on a surface that some view shows. Second row,
+    which takes precedence: which ones some view contradicts, as it has seen through them, or as
+    they lie outside the object's mask, whatever the depth there.
     """
     agrees, empty = torch.zeros(2, len(points), dtype=torch.bool)
     for view in inputs.views:

@@ -38,7 +38,7 @@ def seal(made: Path, part: str) -> None:
     (made / f"{part}.sha256").write_text(folder_digest(made / part))
 
 
-def is_sealed(entry: Path, part: str) -> bool:
+def is_intact(entry: Path, part: str) -> bool:
     """Whether the folder `part` is there as it was when it was sealed."""
     file = entry / f"{part}.sha256"
     return file.is_file() and file.read_bytes() == folder_digest(entry / part).encode()

@@ -113,7 +113,7 @@ class PointMapNetwork(nn.Module):
     def describe(
         self, first: Encoding, second: Encoding
     ) -> tuple[PredictedDescriptors, PredictedDescriptors]:
-        """Both pictures' local features, of a network whose `descriptor_width` is not None."""
+        """The descriptors of both pictures' pixels; the network needs a `descriptor_width`."""
         ones, twos = self._decoded(first, second)
         return (
             _describe(self.downstream_head1, ones, first.grid),
