@@ -23,7 +23,7 @@ from extrap_train.config import (
 from extrap_train.data.co3d import read_category
 from extrap_train.data.scene_spec import SYNTHETIC_SCHEME, open_scene
 from extrap_train.data.sequences import NO_CATEGORY, FrameSequence
-from extrap_train.data.synthetic import build_scene, surface_points
+from extrap_train.data.synthetic import DENSE_POINTS, build_scene, surface_points
 from extrap_train.data.synthetic.capture import synthetic_sequence
 from extrap_train.data.transforms_json import TRANSFORMS, read_transforms
 from extrap_train.diffusion.hub import is_repository, weights_folder
@@ -37,9 +37,6 @@ from extrap_train.errors import InputError
 from extrap_train.store.manifest import MANIFEST, Split
 from extrap_train.store.records import read_record
 from extrap_train.views import stack_poses
-
-CLOUD_POINTS = 20_000
-"""Points sampled on the true surface of a rendered scene."""
 
 
 @dataclass(frozen=True)
@@ -204,7 +201,7 @@ def _synthetic(config: CapturesConfig, category: str, index: int) -> Capture:
     options = SyntheticConfig(frames=config.frames, image_size=config.render_size, seed=config.seed)
 
     def surface() -> TrueSurface:
-        found = surface_points(build_scene(category, index, config.seed), CLOUD_POINTS)
+        found = surface_points(build_scene(category, index, config.seed), DENSE_POINTS)
         points = torch.from_numpy(found.points).float()
         is_object = torch.from_numpy(found.is_object)
         return TrueSurface(points[is_object], points[~is_object])

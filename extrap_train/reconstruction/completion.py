@@ -101,7 +101,7 @@ def complete(
     left = [query for query in queries if query.name not in done]
     while left:
         started = time.perf_counter()
-        query = next_query(pipeline.guided(scene_map), left)
+        query = next_query(scene_map, left)
         planned = time.perf_counter() - started
         left = [other for other in left if other.name != query.name]
         scene_map, added, step = add_view(scene_map, query, pipeline)

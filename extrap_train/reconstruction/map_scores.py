@@ -6,7 +6,7 @@ from dataclasses import asdict
 import numpy as np
 import torch
 
-from extrap_train.data.synthetic import SyntheticScene, surface_points
+from extrap_train.data.synthetic import DENSE_POINTS, SyntheticScene, surface_points
 from extrap_train.geometry.cameras import WorldFrame
 from extrap_train.geometry.viewpoints import directions_from, scene_center
 from extrap_train.metrics import psnr
@@ -20,7 +20,6 @@ from extrap_train.reconstruction.cloud_metrics import (
 from extrap_train.reconstruction.completion import Step
 from extrap_train.reconstruction.global_map import GENERATED, GlobalMap, prior_of
 
-TRUTH_POINTS = 60_000
 SEEN_WITHIN_RAD = np.radians(20)
 """A direction is covered if a view looks from less than this beside it."""
 
@@ -29,7 +28,7 @@ def cloud_scores(
     clouds: dict[str, PointCloud], scene: SyntheticScene, world: WorldFrame
 ) -> dict[str, dict[str, float]]:
     """3-D scores of some clouds (in the map's world) of a synthetic scene, by name."""
-    truth = surface_points(scene, TRUTH_POINTS)
+    truth = surface_points(scene, DENSE_POINTS)
     target, around = truth.points[truth.is_object], truth.points[~truth.is_object]
     size = float((target.max(0) - target.min(0)).max())
     scores: dict[str, dict[str, float]] = {}

@@ -15,7 +15,7 @@ from tests.benchmarks.tables import run_greys, write_own
 def _few_points() -> Iterator[None]:
     """Sample few points of true surfaces, the slowest part of preparing a small capture."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("benchmarks.protocol.captures.CLOUD_POINTS", 1000)
+        patch.setattr("benchmarks.protocol.captures.DENSE_POINTS", 1000)
         yield
 
 

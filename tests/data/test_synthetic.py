@@ -5,8 +5,15 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 
-from extrap_train.data.synthetic import build_scene, handheld_orbit, render, surface_points
+from extrap_train.data.synthetic import (
+    DENSE_POINTS,
+    build_scene,
+    handheld_orbit,
+    render,
+    surface_points,
+)
 from extrap_train.data.synthetic.categories import NAMES as CATEGORIES
 from extrap_train.data.synthetic.shapes import move_mesh
 from extrap_train.errors import InputError
@@ -95,5 +102,17 @@ def test_surface_points_lie_on_what_cameras_see():
     inside = ((pixels > 0) & (pixels < 128)).all(1) & (depth > 0)
     column, row = pixels[inside].long().T
     behind = depth[inside] - view.depth[row, column]
-    assert (behind > -0.03).float().mean() > 0.98  # no point floats in front of a surface
+    # No point floats in front of a surface, but pixels of the outline may show what is behind it.
+    assert (behind > -0.03).float().mean() > 0.96
     assert (behind.abs() < 0.03).float().mean() > 0.5
+
+
+@pytest.mark.parametrize("category", ["apple", "chair"])  # ground of large and of small triangles
+def test_dense_points_leave_no_gap_in_which_a_right_point_would_count_as_wrong(category: str):
+    scene = build_scene(category, 4, seed=0)
+    sparse, dense = surface_points(scene, 4000), surface_points(scene, DENSE_POINTS)
+    height = np.ptp(dense.points[dense.is_object], axis=0).max()
+    near = np.linalg.norm(sparse.points, axis=1) < 1
+    apart = cKDTree(dense.points).query(sparse.points[near])[0]
+    assert (apart < 0.02 * height).mean() > 0.999
+    assert 0.3 < dense.is_object.mean() < 0.7

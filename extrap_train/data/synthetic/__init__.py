@@ -7,9 +7,16 @@
 from extrap_train.data.synthetic.capture import handheld_orbit, sequence_name, walk_seed
 from extrap_train.data.synthetic.categories import build_scene
 from extrap_train.data.synthetic.parts import SyntheticScene
-from extrap_train.data.synthetic.render import SurfacePoints, render, surface_points, trace
+from extrap_train.data.synthetic.render import (
+    DENSE_POINTS,
+    SurfacePoints,
+    render,
+    surface_points,
+    trace,
+)
 
 __all__ = [
+    "DENSE_POINTS",
     "SurfacePoints",
     "SyntheticScene",
     "build_scene",

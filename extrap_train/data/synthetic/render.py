@@ -13,8 +13,12 @@ from extrap_train.data.synthetic.material import LocalPoints, linear_to_srgb
 from extrap_train.data.synthetic.parts import Hits, Part, SyntheticScene
 from extrap_train.views import Camera, View
 
+DENSE_POINTS = 100_000
+"""So many surface points leave no gap of 2 % of the object's size, the tolerance of scores."""
 _REACH = 1.5
 """Farthest points, in object heights from the origin."""
+_LARGE = 0.3
+"""Triangles of a greater radius are cut: a part of them may be within reach."""
 _PIXEL_ANGLE = 0.004
 """Radians: textures are sampled as finely as a photograph shows them."""
 _SHADOW_OFFSET = np.float32(0.004)
@@ -73,29 +77,54 @@ class SurfacePoints:
 
 
 def surface_points(scene: SyntheticScene, count: int) -> SurfacePoints:
-    """Points spread evenly by area over what can be seen from outside within 1.5 of the origin.
+    """Points on what can be seen from outside within 1.5 of the origin: about half of them spread
+    evenly over the object, the others over what surrounds it.
 
     A point is kept where one of the eyes around the scene sees it: inner walls and undersides that
     touch the ground are left out.
     """
     rng = np.random.default_rng(count)
-    mesh = scene.mesh
-    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-    near = np.linalg.norm((a + b + c) / 3, axis=1) < _REACH
-    face = rng.choice(len(area), 3 * count, p=area * near / (area * near).sum())
+    corners, on_object = _triangles_within_reach(scene)
+    a, b, c = corners.swapaxes(0, 1)
+    area = np.linalg.norm(np.cross(b[:, :3] - a[:, :3], c[:, :3] - a[:, :3]), axis=1)
+    for part in (on_object, ~on_object):
+        area[part] /= 2 * area[part].sum()
+    chosen = rng.choice(len(area), 3 * count, p=area)
     u, v = rng.random((2, 3 * count, 1))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    points = a[face] * (1 - u - v) + b[face] * u + c[face] * v
-    corners = mesh.normals[mesh.faces[face]]
-    normals = corners[:, 0] * (1 - u[:, 0:1] - v) + corners[:, 1] * u + corners[:, 2] * v
+    points, normals = np.split(a[chosen] * (1 - u - v) + b[chosen] * u + c[chosen] * v, 2, axis=1)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12
     eyes, seen = _eyes_that_see(scene, points)
     kept = np.flatnonzero(seen)[:count]
     points, normals, eyes = points[kept], normals[kept], eyes[kept].astype(np.float32)
-    is_object = np.array([part.is_object for part in scene.parts])[scene.part_of_face[face[kept]]]
     light = radiance(scene, eyes, (points - eyes).astype(np.float32), _PIXEL_ANGLE)
-    return SurfacePoints(points, normals, linear_to_srgb(light.clip(0, 1)), is_object)
+    return SurfacePoints(points, normals, linear_to_srgb(light.clip(0, 1)), on_object[chosen[kept]])
+
+
+def _triangles_within_reach(
+    scene: SyntheticScene,
+) -> tuple[Float[np.ndarray, "n 3 6"], Bool[np.ndarray, " n"]]:
+    """Position and normal of the triangles' corners, the large ones cut into small ones, and which
+    triangles are of the object.
+    """
+    mesh = scene.mesh
+    corners = np.concatenate([mesh.vertices, mesh.normals], 1)[mesh.faces]
+    on_object = np.array([part.is_object for part in scene.parts])[scene.part_of_face]
+    while True:
+        middle = corners[..., :3].mean(1)
+        radius = np.linalg.norm(corners[..., :3] - middle[:, None], axis=-1).max(1)
+        is_large = radius > _LARGE
+        near = np.linalg.norm(middle, axis=1) < _REACH + np.where(is_large, radius, 0)
+        if not (near & is_large).any():
+            return corners[near], on_object[near]
+        a, b, c = corners[near & is_large].swapaxes(0, 1)
+        ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+        cut = [
+            np.stack(three, 1) for three in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
+        ]
+        small = near & ~is_large
+        corners = np.concatenate([corners[small], *cut])
+        on_object = np.concatenate([on_object[small], np.tile(on_object[near & is_large], 4)])
 
 
 def _eyes_that_see(
