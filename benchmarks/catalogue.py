@@ -26,6 +26,7 @@ from extrap_train.config import (
 from extrap_train.errors import InputError, did_you_mean
 from extrap_train.store.records import read_yaml
 
+_NAMED_CAPTURES = ("captures.categories=", "captures.scenes=")
 TABLE = CommandOptions("benchmark run", "benchmark", TableConfig, {})
 
 
@@ -127,8 +128,14 @@ class Catalogue:
         return composed
 
     def table(self, name: str, overrides: Sequence[str] = ()) -> TableConfig:
-        """A table by name, with `key=value` on top, composed as every other command's options."""
-        table = _compose(name, self.content("table", name), overrides)
+        """A table by name, with `key=value` on top, composed as every other command's options.
+
+        Captures that are named there are not those that the file's `quick.categories` choose from.
+        """
+        content = self.content("table", name)
+        if any(word.startswith(_NAMED_CAPTURES) for word in overrides):
+            content.get("quick", {}).pop("categories", None)
+        table = _compose(name, content, overrides)
         table.scoring.own = {metric: self.metric(metric) for metric in table.scoring.metrics}
         check_options(table)
         return table

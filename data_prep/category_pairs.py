@@ -22,6 +22,8 @@ from extrap_train.config import (
     DataPrepConfig,
     DatasetDepthConfig,
     DepthConfig,
+    DownloadConfig,
+    FoldersConfig,
     LauncherConfig,
     LocalConfig,
     MatcherConfig,
@@ -31,8 +33,7 @@ from extrap_train.config import (
     Uco3dConfig,
     resolve_paths,
 )
-from extrap_train.data import uco3d
-from extrap_train.data.co3d import read_category, require_category
+from extrap_train.data import capture_folders, co3d, uco3d
 from extrap_train.data.co3d.annotations import read_sequence_split
 from extrap_train.data.prepared import PreparedData
 from extrap_train.data.sequences import FrameSequence
@@ -40,6 +41,12 @@ from extrap_train.jobs import Launcher
 from extrap_train.jobs.launchers import open_launcher
 
 LOCAL = LocalConfig()
+_REQUIRE = {
+    Co3dConfig: co3d.require_category,
+    Uco3dConfig: uco3d.require_category,
+    FoldersConfig: capture_folders.require_category,
+}
+"""What refuses a category that is not there, cheaply."""
 
 
 def prepare_category(
@@ -78,7 +85,7 @@ def prepare_category(
         _alone(folder.parent / f".{category}.lock"),
         open_launcher(launcher, workers, folder.parent / "slurm") as opened,
     ):
-        sequences, test_names = _sequences(category, data, output, opened)
+        sequences, test_names = _sequences(category, data, depth, output, opened)
         return prepare(
             sequences,
             depth,
@@ -106,10 +113,9 @@ def prepare_members(
     InputError where a member is not there, before minutes go into those ahead of it.
     """
     members, data = config.category.members, config.data
-    if isinstance(data, Co3dConfig | Uco3dConfig) and data.root is not None:
-        is_co3d = isinstance(data, Co3dConfig)
+    if isinstance(data, DownloadConfig) and data.root is not None:
         for member in members:
-            (require_category if is_co3d else uco3d.require_category)(Path(data.root), member)
+            _REQUIRE[type(data)](Path(data.root), member)
     for member in members:
         yield prepare_category(
             member,
@@ -149,20 +155,24 @@ def _alone(lock: Path) -> Iterator[None]:
 
 
 def _sequences(
-    category: str, data: DataConfig, output: Path, launcher: Launcher
+    category: str, data: DataConfig, depth: DepthConfig, output: Path, launcher: Launcher
 ) -> tuple[list[FrameSequence], set[str] | int]:
     if isinstance(data, SyntheticConfig):
         root = Path(data.root) if data.root else output / "synthetic"
         synthesize(data, category, root, launcher)
         wanted = {f"{i:04d}" for i in range(data.test_sequences + data.train_sequences)}
-        sequences = [s for s in read_category(root, category) if s.name in wanted]
+        sequences = [s for s in co3d.read_category(root, category) if s.name in wanted]
         return sequences, {f"{i:04d}" for i in range(data.test_sequences)}
     assert data.root is not None
     root = Path(data.root)
     if isinstance(data, Uco3dConfig):
         return uco3d.read_category(root, category), data.test_sequences
+    if isinstance(data, FoldersConfig):
+        needs_depth = isinstance(depth, DatasetDepthConfig)
+        captures = capture_folders.read_category(root, category, needs_depth=needs_depth)
+        return captures, data.test_sequences
     assert isinstance(data, Co3dConfig)
-    sequences = read_category(root, category)
+    sequences = co3d.read_category(root, category)
     if data.set_list is None:
         return sequences, data.test_sequences
     train, test = read_sequence_split(root, category, data.set_list)

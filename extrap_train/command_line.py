@@ -27,7 +27,12 @@ _NETWORK_MATCHERS: list[type] = [
 ]
 GROUPS: dict[str, list[type]] = {
     "category": [schema.CategoryConfig],
-    "data": [schema.SyntheticConfig, schema.Co3dConfig, schema.Uco3dConfig],
+    "data": [
+        schema.SyntheticConfig,
+        schema.Co3dConfig,
+        schema.Uco3dConfig,
+        schema.FoldersConfig,
+    ],
     "depth": [
         schema.DatasetDepthConfig,
         schema.StereoConfig,
@@ -156,6 +161,10 @@ _SWEEP = re.compile(r"(choice|range|interval|glob|shuffle|sort|tag)\(.*\)", re.D
 _WIDEST = 44
 """Width of the first column of `--help`, where names are that long."""
 _NO_VALUE = object()
+_NEW_CATEGORY = (
+    ". A category of your own is a file MINE/category/NAME.yaml, written like "
+    "conf/category/apple.yaml, and --config-dir MINE"
+)
 
 
 @dataclass(frozen=True)
@@ -236,7 +245,8 @@ class CommandLine:
         for name in value.split(",") if self.is_sweep else [value]:
             if name not in known and name != "null":
                 near = suggest(name, known)
-                raise InputError(f"{group}={name} is unknown{near}; known: {', '.join(known)}")
+                new = _NEW_CATEGORY if group == "category" else ""
+                raise InputError(f"{group}={name} is unknown{near}; known: {', '.join(known)}{new}")
         return value
 
     def _texts(self, value: str, option: Option) -> str:

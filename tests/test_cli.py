@@ -34,7 +34,7 @@ def own_choices(tmp_path: Path) -> Path:
         (["category=hydrant", "experimnt=paper"], "no option experimnt; did you mean experiment?"),
         (["category=hydrant", "depth.planes=8"], "depth.planes is an option of depth=stereo: give"),
         (["category=hydrant", "data.set_list=dev"], "data.set_list is an option of data=co3d:"),
-        (["category=hydrant", "data=uco3d"], "data=uco3d needs the folder of the download"),
+        (["category=hydrant", "data=uco3d"], "data=uco3d needs the folder of the captures"),
         (["category=hydrant", "depth=files"], "depth.folder=: is no folder; give depth.folder"),
         (["category=hydrant", "trainer.steps=0"], "trainer.steps=0: must be at least 1"),
         (["category=hydrant", "threads=0"], "threads=0: must be at least 1"),

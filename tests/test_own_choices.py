@@ -144,8 +144,9 @@ def test_monocular_depth_takes_a_matcher_from_a_folder(own: Path) -> None:
 
 
 def test_a_table_takes_depth_from_files(own: Path) -> None:
-    content = "defaults: [files_schema, /matcher@matcher: flow, _self_]\nname: ready\nfolder: .\n"
-    (own / "depth" / "ready.yaml").write_text(content)
+    content = "defaults: [files_schema, /matcher@matcher: flow, _self_]\nname: ready\nfolder: {}\n"
+    (own / "a.npz").touch()
+    (own / "depth" / "ready.yaml").write_text(content.format(own))
     assert isinstance(depth_source(Catalogue.with_own([str(own)]).depth("ready")), FilesDepth)
 
 

@@ -20,8 +20,13 @@ from extrap_train.config import (
     RulesConfig,
     SyntheticConfig,
 )
-from extrap_train.data.co3d import read_category
-from extrap_train.data.scene_spec import SYNTHETIC_SCHEME, open_scene
+from extrap_train.data import capture_folders, co3d
+from extrap_train.data.scene_spec import (
+    CO3D_SCHEME,
+    SYNTHETIC_SCHEME,
+    UCO3D_SCHEME,
+    open_scene,
+)
 from extrap_train.data.sequences import NO_CATEGORY, FrameSequence
 from extrap_train.data.synthetic import DENSE_POINTS, build_scene, surface_points
 from extrap_train.data.synthetic.capture import synthetic_sequence
@@ -113,13 +118,13 @@ def _is_there(repository: str, option: str) -> bool:
 
 
 def _held_out_by_all(
-    trained: Trained, category: str, present: Collection[str], count: int
+    trained: Trained, source: str, category: str, present: Collection[str], count: int
 ) -> list[str] | None:
-    """Up to `count` test captures that every model of a category holds out, in the order of a
-    split; None where there is no model of it. Raises InputError where there are none.
+    """Up to `count` test captures that every model of a source's category holds out, in the order
+    of a split; None where there is no model of it. Raises InputError where there are none.
     """
     known = [(t.captures, t.is_of_weights) for t in trained if t.captures.category == category]
-    known = [(captures, is_used) for captures, is_used in known if captures.split.source == "co3d"]
+    known = [(captures, is_used) for captures, is_used in known if captures.split.source == source]
     tested = [captures.split.test for captures, is_used in known if is_used]
     if not tested:
         return None
@@ -154,9 +159,13 @@ def _held_out(config: CapturesConfig, index: int, name: str) -> Split:
     """One of a table's captures as the split that holds it out."""
     if config.source == "synthetic":
         return Split("synthetic", (), (name,), config.seed)
-    if config.source == "scenes" and config.scenes[index].startswith(SYNTHETIC_SCHEME):
+    if config.source != "scenes":
+        return Split("folders" if config.source == "folders" else "co3d", (), (name,))
+    spec = config.scenes[index]
+    if spec.startswith(SYNTHETIC_SCHEME):
         return Split("synthetic", (), (name,), SyntheticConfig().seed)
-    return Split("co3d", (), (name,))
+    scheme = next((s for s in (CO3D_SCHEME, UCO3D_SCHEME) if spec.startswith(s)), "folders:")
+    return Split(scheme.removesuffix(":"), (), (name,))
 
 
 def _open(config: CapturesConfig, categories: list[str], trained: Trained) -> list[Capture]:
@@ -167,9 +176,11 @@ def _open(config: CapturesConfig, categories: list[str], trained: Trained) -> li
                 for category in categories
                 for index in range(config.sequences)
             ]
-        case "co3d":
+        case "co3d" | "folders":
             return [
-                _with_cloud(s) for category in categories for s in _co3d(config, category, trained)
+                _with_cloud(s)
+                for category in categories
+                for s in _held_out_of(config, category, trained)
             ]
         case "reconfusion":
             return [_with_cloud(s) for s in _reconfusion(config)]
@@ -216,15 +227,18 @@ def _with_cloud(sequence: FrameSequence) -> Capture:
     return Capture(sequence, lambda: TrueSurface(read_points(cloud), torch.zeros(0, 3)))
 
 
-def _co3d(config: CapturesConfig, category: str, trained: Trained) -> list[FrameSequence]:
+def _held_out_of(config: CapturesConfig, category: str, trained: Trained) -> list[FrameSequence]:
     """The captures that the models' runs have held out; where no run says so, those that training
-    on the same download with its usual options does.
+    on the same captures with its usual options does.
     """
     if config.root is None:
-        raise InputError("captures.source=co3d needs the download: give captures.root=FOLDER")
-    sequences = {f"{s.category}/{s.name}": s for s in read_category(Path(config.root), category)}
+        raise InputError(
+            f"captures.source={config.source} needs the captures: give captures.root=FOLDER"
+        )
+    read = capture_folders.read_category if config.source == "folders" else co3d.read_category
+    sequences = {f"{s.category}/{s.name}": s for s in read(Path(config.root), category)}
     present = [sequence.name for sequence in sequences.values()]
-    named = _held_out_by_all(trained, category, present, config.sequences)
+    named = _held_out_by_all(trained, config.source, category, present, config.sequences)
     if named is not None:
         return [sequences[f"{category}/{name}"] for name in named]
     verdicts = judge_all(list(sequences.values()), PrepConfig())

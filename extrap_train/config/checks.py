@@ -5,11 +5,13 @@ from typing import Any
 
 from extrap_train.config.commands import PAIR_TASKS, DataPrepConfig, TrainConfig, TrainerConfig
 from extrap_train.config.data_sources import (
-    Co3dConfig,
+    DownloadConfig,
     FilesDepthConfig,
+    Mast3rConfig,
+    MonocularConfig,
     PrepConfig,
+    StereoConfig,
     SyntheticConfig,
-    Uco3dConfig,
 )
 from extrap_train.config.model_options import (
     NEAREST_ALONE,
@@ -31,15 +33,15 @@ def validate(config: TrainConfig | DataPrepConfig) -> None:
     """Check every option and how they go together; raises InputError with option and remedy."""
     check_options(config)
     _check_prep(config.prep)
-    is_download = isinstance(config.data, Co3dConfig | Uco3dConfig)
+    is_download = isinstance(config.data, DownloadConfig)
     if is_download and not config.data.root:
         raise InputError(
-            f"data={config.data.name} needs the folder of the download: give data.root=FOLDER"
+            f"data={config.data.name} needs the folder of the captures: give data.root=FOLDER"
         )
     root = config.data.root
     if root and is_download and not Path(root).is_dir():
         # Before anything is written: a wrong root must not leave a run behind.
-        raise InputError(f"data.root={root}: no such folder; give the folder of the download")
+        raise InputError(f"data.root={root}: no such folder; give the folder of the captures")
     _check_files(config)
     if isinstance(config, DataPrepConfig) and config.model is not None:
         _check_encoder(config.model, config.prep)
@@ -220,6 +222,12 @@ def _check_inputs(config: TrainConfig) -> None:
     if config.task == "complete" and (named or config.inputs) == 1:
         raise InputError(
             "one photograph does not show where its surfaces are; give at least two (inputs=3)"
+        )
+    estimated = isinstance(config.depth, StereoConfig | Mast3rConfig | MonocularConfig)
+    if config.task in ("view", "scene") and estimated and (named or config.inputs) == 1:
+        raise InputError(
+            f"depth={config.depth.name} compares photographs, and only one is given; give at least "
+            "two (inputs=3)"
         )
 
 

@@ -44,7 +44,7 @@ class SyntheticConfig(DataConfig):
 
 @dataclass
 class DownloadConfig(DataConfig):
-    """A data set of captures that is downloaded."""
+    """Captures that are on disk: a downloaded data set, or your own."""
 
     test_sequences: int = option(
         5,
@@ -69,6 +69,13 @@ class Uco3dConfig(DownloadConfig):
     """A uCO3D download."""
 
     name: str = "uco3d"
+
+
+@dataclass
+class FoldersConfig(DownloadConfig):
+    """Captures of your own: a folder per category, in it a folder, archive or video per capture."""
+
+    name: str = "folders"
 
 
 @dataclass

@@ -7,7 +7,7 @@ from typing import Any
 from extrap_train.config.commands import SlurmConfig
 from extrap_train.config.options import MISSING, option
 
-CAPTURE_SOURCES = ("synthetic", "co3d", "reconfusion", "scenes")
+CAPTURE_SOURCES = ("synthetic", "co3d", "folders", "reconfusion", "scenes")
 DRAWS = ("random", "spread", "one_sided", "halves", "given")
 LPIPS_NETS = ("alex", "vgg", "squeeze")
 _SSIM_WINDOW = 11
@@ -54,8 +54,8 @@ class CapturesConfig:
 
     source: str = option(
         "synthetic",
-        "data set: rendered, CO3D, folders with transforms.json and train_test_split_N.json, or "
-        "anything that scene= takes",
+        "data set: rendered, CO3D, your own folders as data=folders reads them, folders with "
+        "transforms.json and train_test_split_N.json, or anything that scene= takes",
         choices=CAPTURE_SOURCES,
     )
     root: str | None = option(None, "folder of the data set; null renders the captures")
@@ -147,7 +147,9 @@ class ScoringConfig:
 class QuickConfig:
     """What `--quick` keeps of a table."""
 
-    categories: list[str] = option([], "categories that --quick keeps", is_set=True)
+    categories: list[str] = option(
+        [], "categories that --quick keeps, unless captures are named", is_set=True
+    )
     sequences: int = option(1, "sequences per category that --quick keeps", low=1, high=10_000)
 
 

@@ -40,13 +40,18 @@ _CAMERA_FILES = (
 
 
 def open_scene(
-    spec: str, synthetic: SyntheticConfig | None = None, poses: MatcherConfig | None = None
+    spec: str,
+    synthetic: SyntheticConfig | None = None,
+    poses: MatcherConfig | None = None,
+    *,
+    needs_depth: bool = False,
 ) -> FrameSequence:
     """The capture that `spec` names; raises InputError that lists the known forms otherwise.
 
     `synthetic` says how many frames, of what size and from which seed a synthetic capture has; its
     defaults are those of `data=synthetic`. `poses` says whose matches place photographs that have
-    no cameras; by default SIFT's.
+    no cameras; by default SIFT's. Those bring no depth either: with `needs_depth` they are refused
+    before their cameras are estimated, which may take minutes.
     """
     if spec.startswith(SYNTHETIC_SCHEME):
         return _open_synthetic(spec, synthetic or SyntheticConfig())
@@ -56,20 +61,24 @@ def open_scene(
         return _open_uco3d(spec)
     path = _expand_home(spec)
     if is_archive(path):
-        return replace(_open_folder(unpack_archive(path), spec, poses), name=path.stem)
+        unpacked = unpack_archive(path)
+        return replace(_open_folder(unpacked, spec, poses, needs_depth), name=path.stem)
     if path.is_file():
         if not is_video(path):
             raise InputError(
                 f"scene {spec!r}: is not a video (MP4, MOV, AVI, Matroska or WebM), nor a .zip or "
                 f".r3d; if it belongs to a capture, give the folder: {path.absolute().parent}"
             )
+        _refuse_without_depth(spec, needs_depth)
         return read_video(path, poses)
     if path.is_dir():
-        return _open_folder(path, spec, poses)
+        return _open_folder(path, spec, poses, needs_depth)
     raise InputError(f"scene {spec!r}: no such file or folder; give {KNOWN_FORMS}")
 
 
-def _open_folder(folder: Path, spec: str, poses: MatcherConfig | None) -> FrameSequence:
+def _open_folder(
+    folder: Path, spec: str, poses: MatcherConfig | None, needs_depth: bool
+) -> FrameSequence:
     if (folder / TRANSFORMS).is_file():
         return read_transforms(folder)
     name = folder.resolve().name
@@ -91,8 +100,17 @@ def _open_folder(folder: Path, spec: str, poses: MatcherConfig | None) -> FrameS
         )
     for place in (folder, folder / "images"):
         if pictures := find_pictures(place):
+            _refuse_without_depth(spec, needs_depth)
             return read_unposed(place, pictures, name, poses)
     raise InputError(f"scene {spec!r}: holds no camera file and no photographs; give {KNOWN_FORMS}")
+
+
+def _refuse_without_depth(spec: str, needs_depth: bool) -> None:
+    if needs_depth:
+        raise InputError(
+            f"scene {spec!r}: photographs without cameras bring no depth, which depth=dataset "
+            "reads; give depth=stereo"
+        )
 
 
 def _camera_like_file(folder: Path) -> Path | None:

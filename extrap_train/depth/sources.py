@@ -20,6 +20,7 @@ from extrap_train.config import (
     required_folder,
 )
 from extrap_train.depth import DatasetDepth, DepthSource
+from extrap_train.depth.depth_folder import SUFFIXES
 from extrap_train.depth.files import FilesDepth
 from extrap_train.depth.mast3r.network.mast3r_checkpoint import read_network
 from extrap_train.depth.mast3r.source import Mast3rDepth
@@ -54,6 +55,11 @@ def depth_source(config: DepthConfig, device: torch.device | None = None) -> Dep
             return MonocularDepth(config, network, found)
         case FilesDepthConfig():
             folder = required_folder(config.folder, "depth.folder", "the folder of the depth maps")
+            if not any(file.suffix in SUFFIXES for file in folder.rglob("*")):
+                raise InputError(
+                    f"depth.folder={folder}: holds no depth map ({', '.join(SUFFIXES)}); add "
+                    "them, or use depth=stereo"
+                )
             is_affine = config.align == "affine"
             matching = matcher(config.matcher, "depth.matcher", device) if is_affine else None
             return FilesDepth(config, folder, matching)

@@ -26,10 +26,12 @@ class TrainedCaptures:
         """The captures held out of a category that this model was trained on.
 
         CO3D's names are unique, whatever category they are filed under; those of rendered captures
-        count within their category, and under another seed are other objects.
+        and of one's own folders count within their category, and under another seed rendered ones
+        are other objects.
         """
         seen = self.split
-        same_namespace = category == self.category or seen.source != "synthetic"
+        is_unique = seen.source not in ("synthetic", "folders")
+        same_namespace = category == self.category or is_unique
         has_seed = None not in (held_out.seed, seen.seed)
         if not same_namespace or held_out.source != seen.source:
             return []

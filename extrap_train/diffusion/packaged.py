@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
-from extrap_train.config import PACKAGED_MODELS, packaged_names
+from extrap_train.config import MODEL_CONFIG, PACKAGED_MODELS, packaged_names
 from extrap_train.errors import InputError
 
 _LEVELS = 7
@@ -27,6 +27,8 @@ _BITS, _SCALE = ":bits", ":scale"
 
 def packaged_weights(name: str, option: str = "model.start") -> Path:
     """Folder of a model that comes with the package; InputError names those that do."""
+    if (Path(name) / "model" / MODEL_CONFIG).is_file():
+        raise InputError(f"{option}={name}: is a run's folder; give {option}={name}/model")
     if name not in packaged_names():
         raise InputError(
             f"{option}={name} is neither a file or folder of weights nor one of the package's: "

@@ -32,8 +32,8 @@ class Split:
     """The captures of one category that a model is trained on, and those held out for testing."""
 
     source: str
-    """`synthetic`, `co3d`, `uco3d` or `PUBLISHED`: captures of different sources are different,
-    whatever their names.
+    """`synthetic`, `co3d`, `uco3d`, `folders` or `PUBLISHED`: captures of different sources are
+    different, whatever their names.
     """
     train: tuple[str, ...]
     test: tuple[str, ...]

@@ -23,7 +23,7 @@ MIN_VIEWS = 3
 
 def run(config: TrainConfig) -> None:
     """Draw `check.png`, replacing an earlier one, and print one line for each thing found."""
-    sequence = open_sequence(config)
+    sequence = open_sequence(config, with_depth=False)
     count = config.inputs or min(len(sequence.frames), MAX_VIEWS)
     chosen = select_input_frames(sequence, config.input_frames, count)
     frames = [sequence.frames[index] for index in chosen]

@@ -26,6 +26,7 @@ _OF_DATA = {
     "synthetic": "captures rendered by extrap-train",
     "co3d": "captures of CO3D (CC BY-NC 4.0)",
     "uco3d": "captures of uCO3D (CC BY 4.0)",
+    "folders": "captures of the uploader's own",
     PUBLISHED: "captures that the authors of published weights chose",
 }
 

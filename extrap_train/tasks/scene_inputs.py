@@ -9,7 +9,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from extrap_train.config import (
+    DatasetDepthConfig,
     DepthConfig,
     FilesDepthConfig,
     SyntheticConfig,
@@ -49,10 +52,18 @@ def required_scene(config: TrainConfig) -> str:
     return config.scene
 
 
-def open_sequence(config: TrainConfig) -> FrameSequence:
-    """The scene's frames, of which no photograph has been read yet."""
+def open_sequence(config: TrainConfig, *, with_depth: bool = True) -> FrameSequence:
+    """The scene's frames, of which no photograph has been read yet.
+
+    Raises InputError, before cameras are estimated, where their depth cannot be had `with_depth`:
+    weights that cannot be used, or depth=dataset for photographs that bring none.
+    """
+    scene = required_scene(config)
     synthetic = config.data if isinstance(config.data, SyntheticConfig) else None
-    return open_scene(required_scene(config), synthetic, config.poses)
+    if with_depth:
+        depth_source(config.depth, torch.device("cpu"))
+    needs_depth = with_depth and isinstance(config.depth, DatasetDepthConfig)
+    return open_scene(scene, synthetic, config.poses, needs_depth=needs_depth)
 
 
 def label_of(sequence: FrameSequence) -> str:

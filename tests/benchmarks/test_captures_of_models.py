@@ -17,7 +17,8 @@ from extrap_train.config import (
 from extrap_train.errors import InputError
 from extrap_train.store.manifest import MANIFEST, Manifest, Split
 from extrap_train.store.records import write_record
-from tests.captures import write_capture
+from tests.captures import view_at, write_capture
+from tests.posed_folders import write_transforms
 
 _NAMES = ("a", "b", "c", "d", "e", "f")
 
@@ -47,6 +48,23 @@ def _models(folder: Path, test: tuple[str, ...]) -> Trained:
     train = tuple(name for name in _NAMES if name not in test)
     _write_run(folder, Split("co3d", train, test))
     return _models_of(str(folder / "{category}-run" / "model"))
+
+
+def _write_folders(root: Path) -> Path:
+    for name in _NAMES[:3]:
+        write_transforms(root / "cup" / name, [view_at(30 * i, 16) for i in range(12)])
+    return root
+
+
+def test_captures_of_ones_own_are_those_that_the_run_has_held_out(tmp_path: Path) -> None:
+    own = _write_folders(tmp_path / "own")
+    weights = _write_run(tmp_path / "runs", Split("folders", ("a", "b"), ("c",)))
+    config = CapturesConfig(source="folders", root=str(own))
+    found = open_captures(config, ["cup"], _models_of(weights))
+    assert [capture.sequence.name for capture in found] == ["c"]
+    config = CapturesConfig(source="scenes", scenes=[str(own / "cup" / "a")])
+    with pytest.raises(InputError, match=r"options\.mine\.weights.*trained on .* cup/a;"):
+        open_captures(config, ["cup"], _models_of(weights))
 
 
 def _captures(root: Path, models: Trained, count: int = 2) -> list[str]:

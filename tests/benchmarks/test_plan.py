@@ -72,6 +72,15 @@ def test_a_quick_part_without_captures_is_named() -> None:
         selected_draws(replace(table, draws=["spread"]), protocol, quick=True)
 
 
+def test_quick_keeps_the_categories_that_the_command_names() -> None:
+    catalogue = Catalogue()
+    assert catalogue.table("table1").quick.categories == ["hydrant"]
+    named = ["captures.categories=[cup,book]", "captures.seed=3"]
+    assert catalogue.table("table1", named).quick.categories == []
+    both = [*named, "quick.categories=[cup]"]
+    assert catalogue.table("table1", both).quick.categories == ["cup"]
+
+
 @pytest.mark.parametrize(
     ("name", "option", "value", "fits"),
     [

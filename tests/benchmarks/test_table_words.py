@@ -148,7 +148,7 @@ def test_the_readmes_method_runs_as_it_stands(tmp_path: Path) -> None:
     text = (Path(__file__).parents[2] / "README.md").read_text()
     source = text.split("```python\n# mine/blur.py\n")[1].split("```")[0]
     assert len(source.splitlines()) <= 20
-    yaml = text.split("printf '")[1].split("'")[0].replace("\\n", "\n")
+    yaml = text.split("mkdir -p mine/method && printf '")[1].split("'")[0].replace("\\n", "\n")
     own = write_own(tmp_path / "own")
     (own / "blur.py").write_text(source)
     (own / "method" / "average.yaml").write_text(yaml)

@@ -1,8 +1,10 @@
 """The package brings a model for every row of the comparison, and stays small."""
 
+from pathlib import Path
+
 import pytest
 
-from extrap_train.config import packaged_names
+from extrap_train.config import MODEL_CONFIG, packaged_names
 from extrap_train.diffusion.model_files import load_model
 from extrap_train.diffusion.packaged import packaged_name, packaged_weights
 from extrap_train.errors import InputError
@@ -33,3 +35,10 @@ def test_each_is_a_model_of_its_family(name: str) -> None:
 def test_an_unknown_name_lists_the_known() -> None:
     with pytest.raises(InputError, match=r"=cup is neither .*: base, megascenes, ours-ap"):
         packaged_weights("cup")
+
+
+def test_a_runs_folder_is_told_to_be_named_with_its_model(tmp_path: Path) -> None:
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / MODEL_CONFIG).write_text("{}")
+    with pytest.raises(InputError, match=rf"weights={tmp_path}: .*{tmp_path / 'model'}"):
+        packaged_weights(str(tmp_path), "weights")

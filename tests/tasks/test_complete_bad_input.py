@@ -90,6 +90,24 @@ def test_a_single_view_is_refused_before_the_scene_is_read(
     assert "at least two" in refused({"no": "cameras"}, one)
 
 
+@pytest.mark.parametrize("task", ["complete", "view", "scene"])
+@pytest.mark.parametrize(
+    ("depth", "said"),
+    [
+        (["depth=mast3r", "depth.checkpoint=gone.pth"], "gone.pth"),
+        (["depth=files", "depth.folder={scene}"], "holds no depth map"),
+        (["depth=stereo", "inputs=1"], "at least two"),
+    ],
+)
+def test_depth_that_cannot_be_had_is_refused_before_the_scene_is_read(
+    task: str, depth: list[str], said: str, refused: Command, tmp_path: Path
+) -> None:
+    (tmp_path / "scene").mkdir()
+    words = [word.format(scene=tmp_path / "scene") for word in depth]
+    orbit = ["orbit=90"] if task == "view" else []
+    assert said in refused({"no": "cameras"}, f"task={task}", *orbit, *words)
+
+
 @pytest.mark.parametrize("task", ["complete", "view", "scene", "category"])
 @pytest.mark.parametrize("inputs", [1, 2, 3])
 def test_a_number_beside_names_is_refused(

@@ -22,7 +22,11 @@ NAMES = tuple(sorted(module.name for module in pkgutil.iter_modules(__path__)))
 def build_scene(category: str, index: int, seed: int) -> SyntheticScene:
     """The scene with this number; raises InputError for a category that is not synthetic."""
     if category not in NAMES:
-        raise InputError(f"no synthetic category '{category}'; there are {', '.join(NAMES)}")
+        raise InputError(
+            f"no synthetic category '{category}'; there are {', '.join(NAMES)}. For captures of "
+            "your own give data=folders data.root=FOLDER, and in a table captures.source=folders "
+            "captures.root=FOLDER"
+        )
     module = importlib.import_module(f"{__name__}.{category}")
     rng = np.random.default_rng([seed, zlib.crc32(category.encode()), index])
     thing = _fit_to_ground(module.build(rng), turn_rad=rng.uniform(0, 2 * np.pi))
