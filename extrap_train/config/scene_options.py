@@ -106,11 +106,12 @@ class ConfidenceConfig:
 
 @dataclass
 class SplatsConfig:
-    """The Gaussians fitted to a completed scene's views: `splats.ply`."""
+    """The Gaussians fitted to a completed scene's views: `splats.ply`, `splats.spz`."""
 
     fit: bool = option(True, "fit Gaussians to the completed views (splats.ply)")
     iterations: int = option(500, "optimisation steps of 3DGS", low=1, high=1_000_000)
     count: int = option(10_000, "most Gaussians", low=1, high=10_000_000)
+    spz: bool = option(False, "also write them as splats.spz, for viewers on the web")
 
 
 @dataclass

@@ -19,6 +19,7 @@ from extrap_train.data.synthetic import SyntheticScene, build_scene
 from extrap_train.depth.sources import depth_source, source_of_generated
 from extrap_train.device import advise_on_sampling_memory
 from extrap_train.errors import InputError
+from extrap_train.gaussians.spz import require_gsply
 from extrap_train.geometry.cameras import WorldFrame
 from extrap_train.reconstruction.capture_check import check_poses
 from extrap_train.reconstruction.cloud_pictures import draw_plan
@@ -142,6 +143,8 @@ def _open_job(config: TrainConfig) -> _Job:
     scene = required_scene(config)
     if _is_generated(config):
         named_weights(config)  # refused before cameras are estimated, which may take minutes
+    if config.complete.splats.spz:
+        require_gsply()
     options = config.data if isinstance(config.data, SyntheticConfig) else SyntheticConfig()
     sequence = open_sequence(config)
     truth = None

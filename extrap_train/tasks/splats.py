@@ -19,6 +19,7 @@ from extrap_train.gaussians.gaussian_model import Gaussians
 from extrap_train.gaussians.gaussian_options import BACKGROUNDS, GaussianOptions
 from extrap_train.gaussians.ply import read_comments, read_splats, write_splats
 from extrap_train.gaussians.rasterize import draw, rasterizer
+from extrap_train.gaussians.spz import write_spz
 from extrap_train.geometry.cameras import WorldFrame
 from extrap_train.metrics import psnr, quantised
 from extrap_train.reconstruction.global_map import GlobalMap
@@ -30,10 +31,10 @@ def write_fitted_splats(
 ) -> dict[str, float]:
     """Fit 3DGS to all views of the map, in the photographs' world, from the views' own depth.
 
-    A file that was fitted to the very same is used again. Writes `splats.ply` and, read back from
-    it and drawn, `splats.png`; returns the number of Gaussians, the mean PSNR in dB of what they
-    show of the views, and the seconds that fitting took (0: used again). `Diverged` where fitting
-    fails.
+    A file that was fitted to the very same is used again. Writes `splats.ply`, `splats.spz` if it
+    is asked for and, read back and drawn, `splats.png`; returns the number of Gaussians, the mean
+    PSNR in dB of what they show of the views, and the seconds that fitting took (0: used again).
+    `Diverged` where fitting fails.
     """
     views = [_outside(each.view, world) for each in scene_map.views]
     gaussian_options = GaussianOptions(
@@ -48,6 +49,11 @@ def write_fitted_splats(
     if fresh:
         fitted = fit_views(views, DatasetDepth(), gaussian_options, seed)
         write_splats(path, fitted.gaussians(), comments=[mark])
+    spz = folder / "splats.spz"
+    if options.spz:
+        write_spz(path, spz)
+    elif fresh:
+        spz.unlink(missing_ok=True)  # it held the Gaussians of before
     seconds = time.perf_counter() - started if fresh else 0.0
     splats = read_splats(path)
     truth = torch.stack([view.image for view in views])
