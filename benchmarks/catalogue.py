@@ -16,6 +16,7 @@ from extrap_train.command_line import CommandLine, CommandOptions, choices_of, o
 from extrap_train.config import (
     LPIPS_NETS,
     METRICS,
+    CapturesConfig,
     DatasetDepthConfig,
     DepthConfig,
     MethodConfig,
@@ -26,7 +27,7 @@ from extrap_train.config import (
 from extrap_train.errors import InputError, did_you_mean
 from extrap_train.store.records import read_yaml
 
-_NAMED_CAPTURES = ("captures.categories=", "captures.scenes=")
+_NAMED_CAPTURES = ("captures.categories=", "captures.scenes=", "captures.source=")
 TABLE = CommandOptions("benchmark run", "benchmark", TableConfig, {})
 
 
@@ -130,12 +131,15 @@ class Catalogue:
     def table(self, name: str, overrides: Sequence[str] = ()) -> TableConfig:
         """A table by name, with `key=value` on top, composed as every other command's options.
 
-        Captures that are named there are not those that the file's `quick.categories` choose from.
+        Where captures are named there, the title and `quick.categories` of the file do not apply.
         """
         content = self.content("table", name)
-        if any(word.startswith(_NAMED_CAPTURES) for word in overrides):
+        is_other = any(word.startswith(_NAMED_CAPTURES) for word in overrides)
+        if is_other:
             content.get("quick", {}).pop("categories", None)
         table = _compose(name, content, overrides)
+        if is_other and not any(word.startswith("title=") for word in overrides):
+            table.title = f"{name} on {_named_captures(table.captures)}"
         table.scoring.own = {metric: self.metric(metric) for metric in table.scoring.metrics}
         check_options(table)
         return table
@@ -169,6 +173,12 @@ def _compose(name: str, content: dict[str, Any], overrides: Sequence[str]) -> Ta
     except (HydraException, OmegaConfBaseException) as error:
         raise InputError(f"table {name}: {explain(error, TABLE, overrides)}") from None
     return table
+
+
+def _named_captures(captures: CapturesConfig) -> str:
+    """What a table is measured on, for its title."""
+    of = captures.scenes if captures.source == "scenes" else captures.categories
+    return f"{', '.join(of)} ({captures.source})"
 
 
 def _check_table(table: TableConfig) -> None:

@@ -124,6 +124,8 @@ def _run(
     left = open_jobs(jobs, folder, console.print)
     still = len(left.to_make) + len(left.to_score)
     console.print(f"{len(jobs)} cells: {len(left.done)} reused, {still} open")
+    for column, reason in missing_networks(jobs[0].scoring).items():
+        console.print(f"{column} stays empty: {reason}")
     if options.dry_run:
         print_plan(jobs, left, folder, console)
         return 0
@@ -234,9 +236,7 @@ def _launchers(
 def print_plan(
     jobs: Sequence[CellJob], left: OpenJobs, folder: TableFolder, console: Console
 ) -> None:
-    """What would run, how long, and what is missing: a method's weights, and the networks without
-    which a column stays empty.
-    """
+    """What would run, how long, and which weights a method lacks."""
     known = _seconds_of_cells(folder)
     making, scoring = (known.groupby("method")[step].median() for step in ("making", "scoring"))
     shown = Table("method", "cells", "to make", "to score", "seconds a cell", "missing")
@@ -257,8 +257,6 @@ def print_plan(
         missing = weights.partition(MISSING_WEIGHTS)[2]
         shown.add_row(name, *(str(len(part)) for part in (mine, to_make, to_score)), rate, missing)
     console.print(shown)
-    for column, reason in missing_networks(jobs[0].scoring).items():
-        console.print(f"{column} stays empty: {reason}")
     duration = timedelta(seconds=round(total))
     said = [f"about {duration} (h:mm:ss) of one core"] if total or not unknown else []
     said += [f"no finished cell tells how long {', '.join(unknown)} will take"] if unknown else []

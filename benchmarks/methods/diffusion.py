@@ -114,7 +114,7 @@ class Diffusion:
         with Stopwatch() as watch:
             made = self.sample(model, inputs)
         size = (inputs.targets.height, inputs.targets.width)
-        given = {"weights": place.name, "depth": "used" if self.family != "zeronvs" else "scale"}
+        given = {"weights": _label(place), "depth": "used" if self.family != "zeronvs" else "scale"}
         given |= photographs_used(inputs.fine_views)
         if made.images.shape[-2:] != size:
             given["made at"] = f"{made.images.shape[-1]} px"
@@ -167,6 +167,11 @@ class Diffusion:
                 f"`python -m extrap_train {recipe}` and give the run's model/ folder as "
                 f"options.METHOD.weights=FOLDER"
             ) from None
+
+
+def _label(place: Path) -> str:
+    """What a table calls weights: a run by its own name, whatever the folder within."""
+    return place.resolve().parent.name if place.name == "model" else place.name
 
 
 def target_names(inputs: SceneInputs) -> list[str]:

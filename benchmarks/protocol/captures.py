@@ -144,9 +144,12 @@ def open_captures(
 ) -> list[Capture]:
     """The test captures of some categories; nothing is rendered or decoded yet.
 
-    Raises InputError for a capture that a model was `trained` on.
+    Raises InputError where there are none, and for one that a model was `trained` on.
     """
     captures = _open(config, categories, trained)
+    if not captures:
+        option = "captures.scenes" if config.source == "scenes" else "captures.categories"
+        raise InputError(f"{option}=[]: the table has no captures; name at least one")
     for index, capture in enumerate(captures):
         sequence = capture.sequence
         held_out = _held_out(config, index, sequence.name)

@@ -62,6 +62,8 @@ def test_captures_of_ones_own_are_those_that_the_run_has_held_out(tmp_path: Path
     config = CapturesConfig(source="folders", root=str(own))
     found = open_captures(config, ["cup"], _models_of(weights))
     assert [capture.sequence.name for capture in found] == ["c"]
+    with pytest.raises(InputError, match=r"captures\.categories=\[\]"):
+        open_captures(config, [], _models_of(weights))
     config = CapturesConfig(source="scenes", scenes=[str(own / "cup" / "a")])
     with pytest.raises(InputError, match=r"options\.mine\.weights.*trained on .* cup/a;"):
         open_captures(config, ["cup"], _models_of(weights))

@@ -72,11 +72,13 @@ def test_a_quick_part_without_captures_is_named() -> None:
         selected_draws(replace(table, draws=["spread"]), protocol, quick=True)
 
 
-def test_quick_keeps_the_categories_that_the_command_names() -> None:
+def test_categories_that_the_command_names_are_kept_by_quick_and_stand_in_the_title() -> None:
     catalogue = Catalogue()
     assert catalogue.table("table1").quick.categories == ["hydrant"]
     named = ["captures.categories=[cup,book]", "captures.seed=3"]
     assert catalogue.table("table1", named).quick.categories == []
+    assert catalogue.table("table1", named).title == "table1 on cup, book (synthetic)"
+    assert catalogue.table("table1", [*named, "title=mine"]).title == "mine"
     both = [*named, "quick.categories=[cup]"]
     assert catalogue.table("table1", both).quick.categories == ["cup"]
 

@@ -24,8 +24,7 @@ def build_scene(category: str, index: int, seed: int) -> SyntheticScene:
     if category not in NAMES:
         raise InputError(
             f"no synthetic category '{category}'; there are {', '.join(NAMES)}. For captures of "
-            "your own give data=folders data.root=FOLDER, and in a table captures.source=folders "
-            "captures.root=FOLDER"
+            "your own give data=folders data.root=FOLDER, or for a table `benchmark run own`"
         )
     module = importlib.import_module(f"{__name__}.{category}")
     rng = np.random.default_rng([seed, zlib.crc32(category.encode()), index])
