@@ -1,21 +1,23 @@
-"""COLMAP's sparse models as captures: cameras and poses, text and binary, without the points.
+"""COLMAP's sparse models as captures: cameras and poses, text and binary.
 
 Read here and not by pycolmap, which trusts the counts that a file states and hangs on damaged ones.
 """
 
 import logging
-import mmap
-import struct
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from extrap_train.data.camera_check import COLMAP_POSES
+from extrap_train.data.colmap_files import (
+    ModelCamera,
+    ModelImage,
+    read_model_cameras,
+    read_model_images,
+)
+from extrap_train.data.colmap_points import Sighting, check_points
 from extrap_train.data.image_files import MAX_PIXELS
 from extrap_train.data.listed_files import ListedFiles
 from extrap_train.data.listed_photographs import (
@@ -23,13 +25,12 @@ from extrap_train.data.listed_photographs import (
     ListedPhotograph,
     sequence_of_photographs,
 )
-from extrap_train.data.paths import MAX_PATH_BYTES, check_relative
+from extrap_train.data.paths import check_relative
 from extrap_train.data.sequences import FrameSequence, PointFile
 from extrap_train.errors import InputError
 from extrap_train.geometry.cuts import Equirectangular
 from extrap_train.geometry.foreign_cameras import (
     CAMERA_MODELS,
-    NAMES_AND_COUNTS,
     lens_from_parameters,
     world_to_cam_from_colmap,
 )
@@ -38,37 +39,10 @@ from extrap_train.geometry.lens import Lens
 POINT_CLOUD = "points3D.ply"
 """Some tools leave one beside the model."""
 _KINDS = ("bin", "txt")
-_MAX_LINE_CHARACTERS = 2**24
-"""A line of points takes about twenty for each."""
-_POINT_2D_BYTES = 24
-"""x, y and the number of the point in space, 8 bytes each."""
+_SIGHTINGS = 32
+"""Images, at least, whose poses are checked against the points."""
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class ModelCamera:
-    """A camera of a model, of any of COLMAP's camera models."""
-
-    number: int
-    model: str
-    height: int
-    width: int
-    parameters: tuple[float, ...]
-    fault: str = ""
-    """What is wrong with its entry, which then says nothing else."""
-
-
-@dataclass(frozen=True)
-class ModelImage:
-    """A posed picture of a model."""
-
-    name: str
-    camera: int
-    quaternion_wxyz: tuple[float, ...]
-    translation: tuple[float, ...]
-    fault: str = ""
-    """What is wrong with its entry, which then says nothing but the name, if that."""
 
 
 def find_model(folder: Path) -> Path | None:
@@ -126,9 +100,27 @@ def read_model(model: Path, images: Path, name: str, upright: bool = False) -> F
         else:
             listed.append(Listed(path, partial(_photograph, entry, cameras, cameras_file, upright)))
     cloud = PointFile(model, POINT_CLOUD)
-    return sequence_of_photographs(
+    sequence = sequence_of_photographs(
         ListedFiles(images), name, listed, images_file, COLMAP_POSES, unusable, cloud
     )
+    check_points(model, _sightings(entries, cameras, cameras_file))
+    return sequence
+
+
+def _sightings(
+    entries: Sequence[ModelImage], cameras: dict[int, ModelCamera], file: Path
+) -> list[Sighting]:
+    """Some of the images that can be used and are no panoramas, with the points that they show."""
+    found = []
+    for entry in entries[:: max(1, len(entries) // _SIGHTINGS)]:
+        try:
+            photo = _photograph(entry, cameras, file, upright=False, path=entry.name)
+        except InputError:  # left out
+            continue
+        if isinstance(photo.lens, Lens):
+            pose, size = photo.world_to_cam, (photo.height, photo.width)
+            found.append(Sighting(pose, photo.lens, *size, entry.observed))
+    return found
 
 
 def _images_file(folder: Path) -> Path | None:
@@ -192,159 +184,3 @@ def _lens(camera: ModelCamera, file: Path) -> Lens | Equirectangular:
             f"{where}: its size {height} x {width} is not valid; export the model again"
         )
     return Equirectangular() if "w" in named else lens_from_parameters(named, model.fisheye)
-
-
-def read_model_cameras(file: Path) -> dict[int, ModelCamera]:
-    """Every camera of a `cameras.bin` or `cameras.txt`, by its number."""
-    found: dict[int, ModelCamera] = {}
-    for camera in _binary_cameras(file) if file.suffix == ".bin" else _text_cameras(file):
-        if found.setdefault(camera.number, camera) != camera:
-            fault = f"{file}: lists camera {camera.number} twice; export the model again"
-            found[camera.number] = replace(camera, fault=fault)
-    return found
-
-
-def read_model_images(file: Path) -> list[ModelImage]:
-    """Every image of an `images.bin` or `images.txt`."""
-    return _binary_images(file) if file.suffix == ".bin" else _text_images(file)
-
-
-class _Cursor:
-    """Walks through the little-endian values of a file; struct.error past its end."""
-
-    def __init__(self, content: mmap.mmap) -> None:
-        self.content, self.at = content, 0
-
-    def read(self, layout: str) -> tuple[Any, ...]:
-        values = struct.unpack_from(f"<{layout}", self.content, self.at)
-        self.at += struct.calcsize(f"<{layout}")
-        return values
-
-    def read_name(self) -> str:
-        end = self.content.find(b"\0", self.at, self.at + MAX_PATH_BYTES + 1)
-        if end < 0:
-            raise struct.error("a name has no end")
-        name = self.content[self.at : end].decode(errors="surrogateescape")
-        self.at = end + 1
-        return name
-
-
-@contextmanager
-def _cursor(file: Path) -> Iterator[_Cursor]:
-    try:
-        with (
-            file.open("rb") as stream,
-            mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content,
-        ):
-            cursor = _Cursor(content)
-            yield cursor
-            if cursor.at > len(content):
-                raise struct.error("the last image's points are missing")
-    except InputError:
-        raise
-    except (struct.error, ValueError, OverflowError):  # ValueError: an empty file
-        raise InputError(f"{file}: is truncated or damaged; export the model again") from None
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read ({error.strerror}); check the file") from None
-
-
-def _binary_cameras(file: Path) -> list[ModelCamera]:
-    cameras = []
-    with _cursor(file) as cursor:
-        for _ in range(*cursor.read("Q")):
-            number, model, width, height = cursor.read("iiQQ")
-            if model not in NAMES_AND_COUNTS:
-                raise InputError(
-                    f"{file}: camera {number} is of the model {model}, which is unknown here; run "
-                    "COLMAP's image_undistorter first"
-                )
-            name, count = NAMES_AND_COUNTS[model]
-            cameras.append(ModelCamera(number, name, height, width, cursor.read(f"{count}d")))
-    return cameras
-
-
-def _binary_images(file: Path) -> list[ModelImage]:
-    images = []
-    with _cursor(file) as cursor:
-        for _ in range(*cursor.read("Q")):
-            _number, *pose, camera = cursor.read("i7di")
-            images.append(ModelImage(cursor.read_name(), camera, tuple(pose[:4]), tuple(pose[4:])))
-            (points,) = cursor.read("Q")
-            cursor.at += points * _POINT_2D_BYTES
-    return images
-
-
-def _text_cameras(file: Path) -> list[ModelCamera]:
-    """`CAMERA_ID MODEL WIDTH HEIGHT PARAMS…` on each line."""
-    cameras = []
-    for number, line in _lines(file):
-        if not line.strip():
-            continue
-        fields = line.split()
-        try:
-            identity = int(fields[0])
-        except ValueError:
-            raise InputError(_malformed(file, number)) from None
-        try:
-            model, width, height, *parameters = fields[1:]
-            numbers = tuple(map(float, parameters))
-            cameras.append(ModelCamera(identity, model, int(height), int(width), numbers))
-        except ValueError:
-            cameras.append(ModelCamera(identity, "", 0, 0, (), _malformed(file, number)))
-    return cameras
-
-
-def _text_images(file: Path) -> list[ModelImage]:
-    """`ID QW QX QY QZ TX TY TZ CAMERA_ID NAME` on one line, on the next its points or nothing."""
-    images: list[ModelImage] = []
-    is_image, blank_at = True, 0
-    for number, line in _lines(file):
-        fields = line.split(maxsplit=9)  # a name may hold spaces
-        if not is_image and len(fields) == 10 and not _is_number(fields[9].split()[0]):
-            raise InputError(
-                f"{file}: line {number} is an image where the points of the one before are "
-                "expected, on a line that may be empty; export the model again"
-            )
-        if not is_image:
-            is_image = True
-        elif not fields:  # allowed before the first image and after the last
-            blank_at = number if images else 0
-        elif blank_at:
-            raise InputError(_malformed(file, blank_at))
-        else:
-            try:
-                pose = tuple(map(float, fields[1:8]))
-                images.append(ModelImage(fields[9].strip(), int(fields[8]), pose[:4], pose[4:]))
-            except (IndexError, ValueError):
-                name = fields[9].strip() if len(fields) == 10 else ""
-                images.append(ModelImage(name, 0, (), (), _malformed(file, number)))
-            is_image = False
-    return images
-
-
-def _is_number(word: str) -> bool:
-    """Points are triples of numbers, so their tenth word is a number; an image's is its name."""
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
-
-
-def _lines(file: Path) -> Iterator[tuple[int, str]]:
-    """Numbered lines without the comments, one at a time."""
-    number = 0
-    try:
-        with file.open(encoding="utf-8-sig", errors="surrogateescape") as stream:
-            while line := stream.readline(_MAX_LINE_CHARACTERS):
-                number += 1
-                if len(line) == _MAX_LINE_CHARACTERS:
-                    raise InputError(f"{file}: line {number} has no end; export the model again")
-                if not line.startswith("#"):
-                    yield number, line
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read ({error.strerror}); check the file") from None
-
-
-def _malformed(file: Path, number: int) -> str:
-    return f"{file}: line {number} is malformed; export the model again"

@@ -23,7 +23,8 @@ from PIL import Image
 
 from extrap_train.config import MatcherConfig, SiftPosesConfig
 from extrap_train.data.camera_check import LONGEST_FOCAL, SHORTEST_FOCAL
-from extrap_train.data.colmap import read_model, read_model_cameras
+from extrap_train.data.colmap import read_model
+from extrap_train.data.colmap_files import read_model_cameras
 from extrap_train.data.image_files import read_photograph, to_eight_bits, upright_photograph
 from extrap_train.data.listed_files import PICTURE_SUFFIXES, counting_order, is_mask_name
 from extrap_train.data.paths import require_file

@@ -10,7 +10,8 @@ from captures import view_at
 from PIL import Image
 from two_views import epipolar_distances
 
-from extrap_train.data.colmap import find_model, read_model, read_model_images
+from extrap_train.data.colmap import find_model, read_model
+from extrap_train.data.colmap_files import read_model_images
 from extrap_train.errors import InputError
 from extrap_train.geometry.foreign_cameras import colmap_from_world_to_cam
 from extrap_train.views import Camera
