@@ -157,9 +157,9 @@ def _without_neighbours(alone: Sequence[View], views: Sequence[View]) -> str:
         why = ""
     return (
         f"depth=stereo finds no depth for {len(alone)} of {len(views)} views ({_names(alone)}): no "
-        f"other view sees the scene from {least}° to {most}° beside them{why}; give more "
-        "photographs (inputs=), choose nearer ones (input_frames=), or use depth=dataset or a "
-        "learned source (depth=mast3r, depth=monocular)"
+        f"other view sees the scene from {least}° to {most}° beside them{why}; give more or "
+        "nearer photographs (inputs=, input_frames=), the depth of a capture that has it "
+        "(depth=dataset), or a learned source (depth=mast3r, depth=monocular)"
     )
 
 

@@ -109,7 +109,8 @@ class StepProgress(Callback):
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Keep what the bar says of it."""
-        self._validation = f", {float(trainer.callback_metrics[ABOVE_BASELINES]):+.2f} dB"
+        above = float(trainer.callback_metrics[ABOVE_BASELINES])
+        self._validation = f", {above:+.2f} dB over the best baseline"
 
     def on_save_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]

@@ -267,13 +267,17 @@ def _print_summary(summary: dict[str, Any], console: Console) -> None:
         console.print(table)
     if summary["held_out"]:
         scores = {k: v for k, v in summary["held_out"].items() if v is not None}
-        console.print("held out: " + ", ".join(f"{k} {v:.3f}" for k, v in scores.items()))
+        count = scores.pop("views")
+        numbers = ", ".join(f"{name} {score:.3f}" for name, score in scores.items())
+        console.print(f"{count:.0f} views at held-out photographs (held_out.png): {numbers}")
     if summary["splats"]:
         count, score = summary["splats"]["gaussians"], summary["splats"]["psnr"]
         again = "" if summary["splats"]["seconds"] else ", used again"
         console.print(f"splats: {count:.0f} Gaussians show the views at {score:.2f} dB{again}")
     error = summary["loop"]["largest_error"]
-    met = "branches did not meet" if error is None else f"{100 * error:.2f} % of the scene's size"
-    console.print(f"loop closure: {met}")
+    apart = "the two ways around did not meet"
+    if error is not None:
+        apart = f"where the two ways around meet, they differ by {error:.1%} of the scene's size"
+    console.print(f"loop closure: {apart}")
     for name, reason in summary["missing"].items():
         console.print(f"missing {name}: {reason}")
