@@ -1,7 +1,7 @@
 """What a completed scene leaves behind: cloud, views, models, pictures and `summary.json`."""
 
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,7 @@ from extrap_train.store.records import write_summary
 from extrap_train.tasks.scene_inputs import photograph_digests
 from extrap_train.tasks.scene_model import UsedWeights, frames_learnt
 from extrap_train.tasks.splats import write_fitted_splats
+from extrap_train.terminal import track
 from extrap_train.views import Camera, stack_cameras
 
 _NOTHING_SHARE = 0.02
@@ -77,13 +78,17 @@ def write_completed(
     cloud = cloud_of(done.scene_map, votes=confidence.votes, subdivide=SUBDIVIDE)
     cloud = cloud[cloud.confidence >= confidence.least_confidence]
     outside = replace(cloud, points=done.world.points_outside(cloud.points))
-    write_cloud(outside, folder / "cloud.ply")
-    write_views(done.scene_map, done.world, folder)
-    write_colmap(done.scene_map, done.world, outside, folder)
+    writers: list[Callable[[], object]] = [
+        lambda: write_cloud(outside, folder / "cloud.ply"),
+        lambda: write_views(done.scene_map, done.world, folder),
+        lambda: write_colmap(done.scene_map, done.world, outside, folder),
+        lambda: draw_growth(done.scene_map, cloud, folder / "growth.png"),
+        lambda: draw_turntable(done.scene_map, cloud, folder / "turntable.mp4"),
+        lambda: _draw_views(done.scene_map, folder / "views.png"),
+    ]
+    for write in track(writers, "exporting", len(writers), "results"):
+        write()
     faces = write_mesh(done.scene_map, done.world, cloud, folder / "mesh.ply")
-    draw_growth(done.scene_map, cloud, folder / "growth.png")
-    draw_turntable(done.scene_map, cloud, folder / "turntable.mp4")
-    _draw_views(done.scene_map, folder / "views.png")
     done.seconds["export"] = time.perf_counter() - started
     started = time.perf_counter()
     splats, no_splats = _fit_splats(done, config, folder)
@@ -205,7 +210,8 @@ def _compare_held_out(
     cameras = [done.world.inside(view.camera) for view in truth]
     made, warps, masks = [], [], []
     only = GlobalMap(done.scene_map.tolerance, given)
-    for view, camera in zip(truth, cameras, strict=True):
+    posed = zip(truth, cameras, strict=True)
+    for view, camera in track(posed, "comparing with held-out photographs", len(truth), "views"):
         near = [done.scene_map.views[i].view for i in _elsewhere(done.scene_map, camera)]
         query = stack_cameras([camera])
         generated = pipeline.generator.generate(near, query, [view.name], config.seed)
