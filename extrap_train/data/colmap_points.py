@@ -101,11 +101,10 @@ def _track_points(
 
 def _misfit(sightings: Sequence[Sighting], tracks: Sequence[Track], reread: Reread) -> float:
     """Median distance of points from their pixels, as a share of the longer side."""
-    errors = [
-        np.linalg.norm(_project(sighting, places, reread) - pixels, axis=1)
-        / max(sighting.height, sighting.width)
-        for sighting, (places, pixels) in zip(sightings, tracks, strict=True)
-    ]
+    errors = []
+    for sighting, (places, pixels) in zip(sightings, tracks, strict=True):
+        offset = _project(sighting, places, reread) - pixels
+        errors.append(np.hypot(*offset.T) / max(sighting.height, sighting.width))
     return float(np.median(np.nan_to_num(np.concatenate(errors), nan=np.inf)))
 
 
