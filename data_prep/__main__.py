@@ -9,6 +9,7 @@ def _run(config: DataPrepConfig) -> None:
     from data_prep.category_pairs import prepare_members
     from data_prep.frame_features import encode_members
     from data_prep.prep_report import write_report
+    from extrap_train.data.shards import write_shards
     from extrap_train.terminal import terminal
 
     workers = config.workers or config.threads
@@ -17,6 +18,9 @@ def _run(config: DataPrepConfig) -> None:
         write_report(prepared, terminal())
     if config.model is not None:
         encode_members(made, config.model)
+    if config.shards is not None:
+        for category, prepared in zip(config.category.members, made, strict=True):
+            write_shards(prepared, category, config.shards)
 
 
 def main() -> None:

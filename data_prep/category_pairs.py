@@ -37,6 +37,8 @@ from extrap_train.data import capture_folders, co3d, uco3d
 from extrap_train.data.co3d.annotations import read_sequence_split
 from extrap_train.data.prepared import PreparedData
 from extrap_train.data.sequences import FrameSequence
+from extrap_train.data.shards import open_shards
+from extrap_train.errors import InputError
 from extrap_train.jobs import Launcher
 from extrap_train.jobs.launchers import open_launcher
 
@@ -132,7 +134,37 @@ def prepare_members(
 
 def prepare_for_training(config: TrainConfig) -> list[PreparedData]:
     """The pairs that a training needs; sequences that failed before are not tried again."""
+    if config.shards is not None:
+        return [*_open_members(config, config.shards)]
     return [*prepare_members(config, workers=config.threads)]
+
+
+def _open_members(config: TrainConfig, shards: str) -> Iterator[PreparedData]:
+    """The pairs of every member from shards; InputError where they were made with other options."""
+    data, depth = resolve_paths(config.data), resolve_paths(config.depth)
+    how = resolve_paths(config.matcher) if is_corrected(data, depth, config.prep) else None
+    asked = _named(asdict(data), asdict(config.prep), repr(depth), repr(how) if how else None)
+    for member in config.category.members:
+        opened = open_shards(shards, member, Path(config.output) / "shards")
+        made = opened.manifest
+        found = _named(made["data"] or {}, made["options"], made["depth"], made["correction"])
+        for name, value in asked.items():
+            if found.get(name) != value:
+                raise InputError(
+                    f"shards={shards}: {member} was prepared with {name}={found.get(name)} and not "
+                    f"{value}; give the same, or prepare it again"
+                )
+        yield opened
+
+
+def _named(
+    data: dict[str, Any], prep: dict[str, Any], depth: str, matcher: str | None
+) -> dict[str, Any]:
+    """Options by their names, as JSON gives them; the captures may lie elsewhere by now."""
+    named = {f"data.{name}": value for name, value in data.items() if name != "root"}
+    named |= {f"prep.{name}": value for name, value in prep.items()}
+    options: dict[str, Any] = json.loads(json.dumps(named | {"depth": depth, "matcher": matcher}))
+    return options
 
 
 def is_corrected(data: DataConfig, depth: DepthConfig, prep: PrepConfig) -> bool:

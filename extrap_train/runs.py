@@ -43,6 +43,7 @@ _NOT_PART_OF_THE_RUN = (
     "run",
     "repo",
     "resume",
+    "shards",
     "threads",
     "logger",
     "validation",

@@ -5,6 +5,7 @@ variants of a group; this package says what may stand in them.
 """
 
 from extrap_train.config.checks import (
+    check_shards_address,
     notes,
     require_published,
     required_file,

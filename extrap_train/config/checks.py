@@ -2,6 +2,7 @@
 
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from extrap_train.config.commands import PAIR_TASKS, DataPrepConfig, TrainConfig, TrainerConfig
 from extrap_train.config.data_sources import (
@@ -32,8 +33,12 @@ _PUBLISHED_STEPS = tuple(n for n in range(2, 501) if 1000 % n == 0)
 def validate(config: TrainConfig | DataPrepConfig) -> None:
     """Check every option and how they go together; raises InputError with option and remedy."""
     check_options(config)
+    if config.shards is not None:
+        check_shards_address(config.shards)
     _check_prep(config.prep)
     is_download = isinstance(config.data, DownloadConfig)
+    if isinstance(config, TrainConfig) and config.task in PAIR_TASKS and config.shards:
+        is_download = False  # the captures may be on another machine
     if is_download and not config.data.root:
         raise InputError(
             f"data={config.data.name} needs the folder of the captures: give data.root=FOLDER"
@@ -267,4 +272,14 @@ def check_sampler(sampler: SamplerConfig) -> None:
         raise InputError(
             f"sampler.solver={sampler.solver} is deterministic and none of the published runs: "
             "sampler.eta and sampler.compat need sampler.solver=ddim; without them, sampler.eta=0"
+        )
+
+
+def check_shards_address(address: str) -> None:
+    """Raise InputError, which does not repeat it, for an address that contains credentials."""
+    parts = urlsplit(address) if "://" in address else None
+    if parts and ("@" in parts.netloc or parts.query or parts.fragment or "::" in address):
+        raise InputError(
+            "shards: an address may have no '@' before its first '/' and no '?', '#' or '::', as "
+            "it is printed; give credentials in the environment variables of the store"
         )

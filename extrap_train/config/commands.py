@@ -226,6 +226,9 @@ class TrainConfig(SceneOptions):
     to: str | None = option(None, "folder that task=convert writes")
     repo: str | None = option(None, "repository of the hub that task=push uploads to, as org/name")
     resume: bool = option(True, "continue or reuse what is there; false replaces it")
+    shards: str | None = option(
+        None, "folder or s3:// address of shards to train on; captures are then not needed"
+    )
     output: str = option("outputs", "folder of all results")
     threads: int | None = option(None, "CPU threads; null: every core", low=1)
 
@@ -241,6 +244,9 @@ class DataPrepConfig:
     launcher: LauncherConfig = MISSING
     model: ModelConfig | None = None
     """Whose frozen networks encode every training frame once, for trainer.latents=cached."""
+    shards: str | None = option(
+        None, "folder or s3:// address that the pairs are also written to, for training elsewhere"
+    )
     prep: PrepConfig = field(default_factory=PrepConfig)
     output: str = option("outputs", "folder of all results")
     workers: int | None = option(

@@ -30,6 +30,7 @@ from torch import Tensor
 from extrap_train.config import PrepConfig, options_of
 from extrap_train.data.frame_files import (
     FLOWS,
+    FRAMES,
     REMEDY,
     StoredFrames,
     damaged_error,
@@ -45,6 +46,8 @@ from extrap_train.store.records import read_record
 from extrap_train.views import Camera, ViewPair
 
 FORMAT = 6
+Fetch = Callable[[Path], None]
+"""Lets a file be where it is wanted, or raises InputError."""
 _MAX_SIZE = options_of(PrepConfig)["image_size"].declared.high
 UNTOUCHED = -1
 """Flow number of a pair without a flow: its warp stays as it is."""
@@ -124,8 +127,10 @@ class PreparedData:
         sequences: pd.DataFrame,
         frames: pa.Table,
         pairs: pd.DataFrame,
+        fetch: Fetch | None = None,
     ) -> None:
         self.folder = folder
+        self._fetch = fetch
         self.manifest = manifest
         self.sequences = sequences
         """One row per sequence: name, verdict with reason, measurements, split, number of pairs."""
@@ -153,8 +158,11 @@ class PreparedData:
         )
 
     @classmethod
-    def open(cls, folder: Path) -> "PreparedData":
-        """Open a finished preparation; raises InputError where it is missing or damaged."""
+    def open(cls, folder: Path, fetch: Fetch | None = None) -> "PreparedData":
+        """Open a finished preparation; raises InputError where it is missing or damaged.
+
+        Frames and flows that are not there yet are put there by `fetch`.
+        """
         manifest = read_preparation(folder)
         tables = {name: _read_table(folder, name, manifest) for name in TABLES}
         try:
@@ -164,6 +172,7 @@ class PreparedData:
                 tables["sequences"].to_pandas(),
                 tables["frames"],
                 tables["pairs"].to_pandas(),
+                fetch,
             )
         except (KeyError, ValueError, TypeError, IndexError) as error:
             raise damaged_error(folder, f"a column is missing or odd: {error}") from None
@@ -249,23 +258,43 @@ class PreparedData:
         return numbers
 
     def _open_flows(self, sequence: str) -> np.ndarray:
-        folder = pairs_folder(self._pairs_root, sequence, self.roles[sequence])
+        folder = self._pairs_folder(sequence)
         grid = self.manifest["options"].get("correction_grid")
-        flows = map_array(folder / FLOWS)
+        flows = map_array(self._here(folder / FLOWS))
         if flows.shape[1:] != (2, grid, grid) or flows.dtype != np.float16:
             raise damaged_error(folder, f"flows are {flows.shape}")
         return flows
 
     def _open_archive(self, sequence: str) -> StoredFrames:
-        is_lone = self.roles[sequence] == "train and test"
-        folder = frames_folder(self._frames_root, sequence, is_lone)
-        rows = self._rows[sequence]
+        folder, rows = self._frames_folder(sequence), self._rows[sequence]
+        self._here(folder / FRAMES)
         table = self._frames.slice(rows.start, rows.stop - rows.start)
         return StoredFrames(folder, table, self.image_size)
 
-    def __reduce__(self) -> tuple[Callable[[Path], "PreparedData"], tuple[Path]]:
+    def files(self, sequence: str) -> list[tuple[Path, Path]]:
+        """The files that a sequence's frames and flows are read from, each after its root."""
+        found = [(self._frames_root, self._frames_folder(sequence) / FRAMES)]
+        if self.is_corrected:
+            found.append((self._pairs_root, self._pairs_folder(sequence) / FLOWS))
+        return found
+
+    def _frames_folder(self, sequence: str) -> Path:
+        is_lone = self.roles[sequence] == "train and test"
+        return frames_folder(self._frames_root, sequence, is_lone)
+
+    def _pairs_folder(self, sequence: str) -> Path:
+        return pairs_folder(self._pairs_root, sequence, self.roles[sequence])
+
+    def _here(self, file: Path) -> Path:
+        if self._fetch is not None:
+            self._fetch(file)
+        return file
+
+    def __reduce__(
+        self,
+    ) -> tuple[Callable[[Path, Fetch | None], "PreparedData"], tuple[Path, Fetch | None]]:
         """In another process the folder is opened anew: a pickled memory map would be a copy."""
-        return PreparedData.open, (self.folder,)
+        return PreparedData.open, (self.folder, self._fetch)
 
 
 def read_preparation(folder: Path) -> dict[str, Any]:

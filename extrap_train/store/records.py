@@ -48,15 +48,23 @@ def read_record(path: Path, kind: type[T], remedy: str) -> T:
     larger than `MAX_RECORD_BYTES`.
     """
     try:
-        if path.stat().st_size > MAX_RECORD_BYTES:
-            raise InputError(f"{path}: damaged (larger than such a file can be); {remedy}")
-        return TypeAdapter(kind).validate_json(path.read_bytes(), strict=True)
+        with path.open("rb") as file:
+            content = file.read(MAX_RECORD_BYTES + 1)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
+    return parse_record(content, str(path), kind, remedy)
+
+
+def parse_record(content: bytes, where: str, kind: type[T], remedy: str) -> T:
+    """The record in a file's content, as `read_record` reads it; errors say `where` it is."""
+    if len(content) > MAX_RECORD_BYTES:
+        raise InputError(f"{where}: damaged (larger than such a file can be); {remedy}")
+    try:
+        return TypeAdapter(kind).validate_json(content, strict=True)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         entry = ".".join(map(str, first["loc"])) or "the file"
-        raise InputError(f"{path}: damaged ({entry}: {first['msg']}); {remedy}") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
+        raise InputError(f"{where}: damaged ({entry}: {first['msg']}); {remedy}") from None
 
 
 def read_yaml(path: Path, remedy: str) -> dict[str, Any]:
