@@ -12,7 +12,7 @@ from torch import Tensor
 from benchmarks.perf.timing import Timing, compare
 from benchmarks.perf.warp_timing import bumpy_depth, orbit_camera
 from extrap_train.geometry.alignment import Edges, align_view
-from extrap_train.geometry.cameras import pixel_grid, transform, unproject_to_world
+from extrap_train.geometry.cameras import transform, unproject_to_world
 from extrap_train.views import Camera
 
 SIZE = 128
@@ -130,7 +130,6 @@ def align_by_descent(camera: Camera, edges: Edges, steps: int = STEPS) -> Float[
     views' points to where they belong, over the edges' similarities and the new depth. Starts from
     each edge's plain weighted Procrustes and the first edge's depth; cosine schedule.
     """
-    rays = _rays(camera, edges.new_points)
     known_weight = edges.known_confidence.log1p() * edges.world_known
     new_weight = edges.new_confidence.log1p()
     rotation, shift, scale = roma.rigid_points_registration(
@@ -147,7 +146,7 @@ def align_by_descent(camera: Camera, edges: Edges, steps: int = STEPS) -> Float[
         optimizer.zero_grad()
         unit = quaternion / quaternion.norm(dim=-1, keepdim=True)
         pose = (roma.unitquat_to_rotmat(unit), shift, log_scale.exp())
-        new_world = transform(camera.cam_to_world, rays * log_depth.exp()[..., None])
+        new_world = unproject_to_world(log_depth.exp(), camera)
         new_error = (_moved(*pose, edges.new_points) - new_world).norm(dim=-1)
         known_error = (_moved(*pose, edges.known_points) - edges.world_points).norm(dim=-1)
         loss = (new_error * new_weight).mean() + (known_error * known_weight).mean()
@@ -155,13 +154,6 @@ def align_by_descent(camera: Camera, edges: Edges, steps: int = STEPS) -> Float[
         optimizer.step()
         schedule.step()
     return log_depth.detach().exp()
-
-
-def _rays(camera: Camera, like: Tensor) -> Float[Tensor, "h w 3"]:
-    grid = pixel_grid(camera.height, camera.width).to(like)
-    k = camera.intrinsics
-    x, y = (grid[..., 0] - k[0, 2]) / k[0, 0], (grid[..., 1] - k[1, 2]) / k[1, 1]
-    return torch.stack([x, y, torch.ones_like(x)], -1)
 
 
 def _moved(rotation: Tensor, shift: Tensor, scale: Tensor, points: Tensor) -> Tensor:

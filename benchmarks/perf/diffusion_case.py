@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import product
 
 import torch
@@ -122,7 +123,7 @@ def batch_of(count: int, device: torch.device) -> PairBatch:
 def forward_flops(config: ModelConfig) -> int:
     """Floating-point operations of one image through the denoiser, attention included."""
     with FakeTensorMode():
-        unet = ExtrapolationModel(config).unet
+        unet = ExtrapolationModel(replace(config, clip=None)).unet  # which it does not depend on
         unet.set_attn_processor(AttnProcessor())  # products that the counter knows
         channels, side = unet.config["in_channels"], unet.config["sample_size"]
         with FlopCounterMode(display=False) as counter:
