@@ -2,7 +2,6 @@
 preparation.
 """
 
-import hashlib
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -41,6 +40,7 @@ from extrap_train.data.shards import open_shards
 from extrap_train.errors import InputError
 from extrap_train.jobs import Launcher
 from extrap_train.jobs.launchers import open_launcher
+from extrap_train.store.digests import json_digest
 
 LOCAL = LocalConfig()
 _REQUIRE = {
@@ -79,7 +79,7 @@ def prepare_category(
     pairs_of = [*frames_of, pair_options(prep), correction]
     all_of = [category, asdict(data), asdict(depth), asdict(prep), correction]
     frames, pairs, folder = (
-        output / kind / f"{category}-{_digest(made_of)}"
+        output / kind / f"{category}-{json_digest(made_of)[:8]}"
         for kind, made_of in (("frames", frames_of), ("pairs", pairs_of), ("data", all_of))
     )
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -215,7 +215,3 @@ def _source(data: DataConfig) -> dict[str, Any]:
     """What a photograph depends on: not on which sequences are for what."""
     split = ("test_sequences", "train_sequences", "set_list")
     return {name: value for name, value in asdict(data).items() if name not in split}
-
-
-def _digest(parts: list[Any]) -> str:
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:8]

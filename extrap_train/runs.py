@@ -1,7 +1,5 @@
 """The folder of a training run: its name, its manifest, and which run is the latest."""
 
-import hashlib
-import json
 import os
 import platform
 from collections.abc import Mapping
@@ -26,7 +24,7 @@ from extrap_train.data.prepared import PreparedData
 from extrap_train.diffusion.hub import is_repository, weights_folder
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import partial_path, write_atomic
-from extrap_train.store.digests import folder_digest, weights_digest
+from extrap_train.store.digests import folder_digest, json_digest, weights_digest
 from extrap_train.store.manifest import (
     REMEDY,
     Manifest,
@@ -177,13 +175,9 @@ def _all_options(config: TrainConfig) -> dict[str, Any]:
     return asdict(resolve_paths(config)) | {"sampler": asdict(sampler)}
 
 
-def _digest(identity: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
-
-
 def run_folder(config: TrainConfig) -> RunFolder:
     """Where the run lies or will lie; raises InputError if no folder may be called so."""
-    name = given_name(config) or f"seed{config.seed}-{_digest(run_identity(config))[:8]}"
+    name = given_name(config) or f"seed{config.seed}-{json_digest(run_identity(config))[:8]}"
     return RunFolder(_runs_of(config) / name)
 
 
@@ -297,7 +291,7 @@ def point_latest(folder: RunFolder) -> None:
 def provenance(config: TrainConfig, data_hashes: dict[str, str]) -> dict[str, Any]:
     """What a result was made with: configuration, data, seed, device and versions."""
     return {
-        "config": _digest(run_identity(config)),
+        "config": json_digest(run_identity(config)),
         "data": data_hashes,
         "seed": config.seed,
         "start": config.model.start,

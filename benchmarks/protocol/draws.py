@@ -24,6 +24,7 @@ from extrap_train.geometry.viewpoints import (
     scene_center,
 )
 from extrap_train.store.atomic import write_atomic
+from extrap_train.store.digests import json_digest
 from extrap_train.store.records import read_record
 from extrap_train.views import Camera
 
@@ -58,7 +59,7 @@ class Protocol:
     @property
     def sha256(self) -> str:
         """SHA-256 of the whole content, which every result carries."""
-        return digest(asdict(self))
+        return json_digest(asdict(self))
 
     @classmethod
     def read(cls, file: Path) -> "Protocol":
@@ -75,19 +76,14 @@ class Protocol:
 def write_sealed(file: Path, record: object) -> None:
     """Write a dataclass as `read_record` reads it, with the digest of its content."""
     content: dict[str, Any] = asdict(record)  # type: ignore[call-overload]
-    content["sha256"] = digest(content)
+    content["sha256"] = json_digest(content)
     write_atomic(file, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
 
 
 def is_sealed(file: Path) -> bool:
     """Whether a file holds what `write_sealed` wrote; InputError if it is not JSON."""
     content = read_json(file)
-    return bool(content.pop("sha256", None) == digest(content))
-
-
-def digest(content: Any) -> str:
-    """SHA-256 of a JSON value, whatever the order of its keys."""
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    return bool(content.pop("sha256", None) == json_digest(content))
 
 
 def draw_sequence(

@@ -34,10 +34,11 @@ from benchmarks.protocol.array_files import (
     read_limited,
     sha256_of,
 )
-from benchmarks.protocol.draws import Draw, digest
+from benchmarks.protocol.draws import Draw
 from extrap_train.depth import DatasetDepth, DepthMap
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import atomic_folder
+from extrap_train.store.digests import json_digest
 from extrap_train.store.records import read_record
 from extrap_train.views import Camera, View
 
@@ -134,7 +135,7 @@ class Scene:
     def data_hash(self) -> str:
         """Hash of every file and camera in the scene."""
         kept = asdict(self.record)
-        return digest([kept[part] for part in ("draw", "inputs", "targets", "files")])
+        return json_digest([kept[part] for part in ("draw", "inputs", "targets", "files")])
 
     @property
     def truth_folder(self) -> Path:

@@ -17,7 +17,6 @@ from pathlib import Path
 from pydantic import TypeAdapter, ValidationError
 
 from benchmarks.methods.base import Method, Unavailable
-from benchmarks.protocol.draws import digest
 from benchmarks.protocol.prepared_scene import Scene
 from benchmarks.run.cells import one_line
 from benchmarks.run.run_method import build_method, weight_paths
@@ -28,7 +27,7 @@ from extrap_train.factories import module_file
 from extrap_train.jobs import Died
 from extrap_train.jobs.isolated import IsolatedLauncher
 from extrap_train.metrics import BACKBONES, hub_cache
-from extrap_train.store.digests import file_digest
+from extrap_train.store.digests import file_digest, json_digest
 from extrap_train.store.manifest import Manifest
 
 KEY_LENGTH = 20
@@ -53,12 +52,12 @@ _NO_SOURCES = ("site-packages", "dist-packages", "__pycache__")
 
 def cell_key(made_from: Manifest, scored_from: Manifest) -> str:
     """A cell's name."""
-    return digest([identity_of(made_from), identity_of(scored_from)])[:KEY_LENGTH]
+    return json_digest([identity_of(made_from), identity_of(scored_from)])[:KEY_LENGTH]
 
 
 def identity_of(manifest: Manifest) -> str:
     """Digest of what a manifest's differences are about."""
-    return digest([dict(manifest.options), dict(manifest.inputs)])
+    return json_digest([dict(manifest.options), dict(manifest.inputs)])
 
 
 def making_code(module: str = "") -> str:

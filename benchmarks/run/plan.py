@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.protocol.captures import Capture, freeze, open_captures, trained_models
-from benchmarks.protocol.draws import Draw, Protocol, digest, write_sealed
+from benchmarks.protocol.draws import Draw, Protocol, write_sealed
 from benchmarks.protocol.prepared_scene import Scene, truths_of
 from benchmarks.protocol.scene_writing import prepare_scene
 from benchmarks.run.cells import OK, Cell, CellJob, read_cell
@@ -24,7 +24,7 @@ from extrap_train.config import DepthConfig, MethodConfig, TableConfig
 from extrap_train.data.frame_files import sequence_folder
 from extrap_train.depth.sources import weight_files
 from extrap_train.errors import InputError
-from extrap_train.store.digests import file_digest
+from extrap_train.store.digests import file_digest, json_digest
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ def prepare_draws(
     made_by = [preparing_code(), asdict(table.captures), asdict(table.rules)]
     made_by += [asdict(depth), {str(file): file_digest(file) for file in files}]
     for draw in draws:
-        origin = digest([*made_by, asdict(draw)])
+        origin = json_digest([*made_by, asdict(draw)])
         capture = by_name[draw.category, draw.sequence]
         yield prepare_scene(folder.scene(draw), capture, draw, table.rules, depth, origin)
 
@@ -188,7 +188,7 @@ def require_different(methods: Iterable[MethodConfig]) -> None:
     """InputError for two methods that are the same: one cell cannot be two rows."""
     known: dict[str, MethodConfig] = {}
     for method in methods:
-        other = known.setdefault(digest([method.factory, method.options]), method)
+        other = known.setdefault(json_digest([method.factory, method.options]), method)
         if other is not method:
             raise InputError(
                 f"methods {other.name} and {method.name} are the same, with the same options; "

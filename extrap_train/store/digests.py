@@ -1,12 +1,14 @@
-"""SHA-256 of files' contents; a large file's is computed once and kept in the user's cache."""
+"""SHA-256 of values and of files; a large file's is computed once and kept in the user's cache."""
 
 import hashlib
+import json
 import os
 import re
 import time
 from collections.abc import Iterable, Iterator, Set
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from extrap_train.errors import InputError
 from extrap_train.store.atomic import write_atomic
@@ -42,6 +44,11 @@ def file_digest(path: Path) -> str:
         return digest
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+
+
+def json_digest(content: Any) -> str:
+    """SHA-256 of a JSON value, whatever the order of its keys."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def files_below(folder: Path, above: Set[Path] = frozenset()) -> Iterator[Path]:

@@ -1,7 +1,5 @@
 """`task=validate`: a finished run measured again, sampled as the options under `sampler` say."""
 
-import hashlib
-import json
 import time
 from dataclasses import asdict, replace
 
@@ -14,7 +12,7 @@ from extrap_train.diffusion.training import CategoryTraining
 from extrap_train.metrics import lpips_or_reason
 from extrap_train.runs import Finished, RunFolder, existing_run, trained_on
 from extrap_train.store import Outcome
-from extrap_train.store.digests import folder_digest
+from extrap_train.store.digests import folder_digest, json_digest
 from extrap_train.store.manifest import Conflict, Manifest, claim, read_manifest
 from extrap_train.tasks.category import quiet_trainer, quieten_lightning
 from extrap_train.tasks.results import print_places, write_results
@@ -40,8 +38,9 @@ def run(config: TrainConfig, prepare: Prepare) -> Outcome:
     model = load_model(trained.model)
     sampler = sampler_for(config.sampler, model.config)
     options = {"sampler": asdict(sampler), "validation": asdict(config.validation)}
-    digest = hashlib.sha256(json.dumps(options, sort_keys=True).encode()).hexdigest()[:8]
-    folder = RunFolder(trained.path / "validations" / f"seed{config.seed}-{digest}")
+    folder = RunFolder(
+        trained.path / "validations" / f"seed{config.seed}-{json_digest(options)[:8]}"
+    )
     manifest = Manifest.of(dotted(options), {"model": folder_digest(trained.model)})
     with claim(folder.path, manifest, resume=False) as result:
         quieten_lightning()
