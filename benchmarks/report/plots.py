@@ -21,20 +21,14 @@ ANGLE_METRICS = ("masked_psnr", "psnr", "lpips_squeeze", "lpips_alex")
 
 def plots(results: Results) -> dict[str, str]:
     """SVG texts by name; a metric that no cell has is left out."""
+    images, means, drawn = results.by_image.dropna(subset=["value"]), results.means(), {}
     with plt.rc_context({"text.parse_math": False, "svg.hashsalt": "table"}):  # the same bytes
-        return _plots(results)
-
-
-def _plots(results: Results) -> dict[str, str]:
-    images = results.by_image.dropna(subset=["value"])
-    drawn = {}
-    for metric in ANGLE_METRICS:
-        part = images[images["metric"] == metric]
-        if len(part):
-            drawn[f"{metric}_over_angle"] = _over_angle(part, metric, results)
-    means = results.means()
-    if len(means[means["metric"] == "masked_psnr"]):
-        drawn["masked_psnr_over_time"] = _over_time(means, "masked_psnr", results)
+        for metric in ANGLE_METRICS:
+            part = images[images["metric"] == metric]
+            if len(part):
+                drawn[f"{metric}_over_angle"] = _over_angle(part, metric, results)
+        if len(means[means["metric"] == "masked_psnr"]):
+            drawn["masked_psnr_over_time"] = _over_time(means, "masked_psnr", results)
     return drawn
 
 

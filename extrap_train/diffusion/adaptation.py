@@ -161,12 +161,13 @@ class _HeldOut:
         levels = sampling_timesteps(model.schedule, sampler)
         levels = levels[:: -(-len(levels) // _LEVELS)].to(fabric.device)
         draws = -(-_DRAWS // len(batch.image))
-        places = torch.arange(len(batch.image)).split(most_at_once)
-        parts = [self._part(_chosen(batch, part)) for part in places]
+        split = torch.arange(len(batch.image)).split(most_at_once)
+        parts = [self._part(batch, places) for places in split]
         self.taken = [(part, level) for part in parts for level in levels for _ in range(draws)]
 
     @torch.no_grad()
-    def _part(self, batch: PairBatch) -> _Part:
+    def _part(self, batch: PairBatch, places: Int[Tensor, " n"]) -> _Part:
+        batch = combine([batch], lambda tensors: tensors[0][places])
         batch = compute_warp(batch.to(self.fabric.device), self.model.config.image_size)
         with self.fabric.autocast():
             conditioning = self.model.condition(batch)
@@ -205,10 +206,6 @@ class _HeldOut:
         with self.fabric.autocast():
             levels = level.expand(len(target))
             return prediction_errors(self.model, target, noise, levels, conditioning, anchor)
-
-
-def _chosen(batch: PairBatch, places: Int[Tensor, " n"]) -> PairBatch:
-    return combine([batch], lambda tensors: tensors[0][places])
 
 
 def _weights(adapter: peft.PeftModel) -> dict[str, Tensor]:

@@ -84,14 +84,11 @@ def _download(name: str, option: str) -> Path:
         reason, remedy = f"{place} has no revision {revision}", "give another @REVISION, or none"
     except RepositoryNotFoundError:
         reason = f"no such path, and no such repository at {place}, or none that you may read"
-        remedy = f"check the name, log in (hf auth login), or give one of {_known()}"
+        known = ", ".join(packaged_names())
+        remedy = f"check the name, log in (hf auth login), or give one of {known}"
     except HUB_FAILURES as error:
         reason, remedy = f"{place}: {first_line(error)}", "try again"
     raise InputError(f"{said}: {reason}; {remedy}")
-
-
-def _known() -> str:
-    return ", ".join(packaged_names())
 
 
 def first_line(error: BaseException) -> str:

@@ -42,21 +42,15 @@ def zeronvs_pose(
     in less: far from the world's origin the product would lose the translation.
     """
     with torch.autocast(reference.world_to_cam.device.type, enabled=False):
-        return _zeronvs_pose(reference, query, scale)
-
-
-def _zeronvs_pose(
-    reference: Camera, query: Camera, scale: Float[Tensor, " b"]
-) -> Float[Tensor, "b 19"]:
-    reference_to_world = opengl_from_world_to_cam(reference.world_to_cam)
-    query_to_world = opengl_from_world_to_cam(query.world_to_cam)
-    relative = torch.linalg.inv(reference_to_world) @ query_to_world
-    relative[:, :3, 3] = 5.0 * torch.tanh(relative[:, :3, 3] / scale[:, None] / 10.0)
-    fov_rad = torch.minimum(
-        2 * torch.atan(query.width / (2 * query.intrinsics[:, 0, 0])),
-        2 * torch.atan(query.height / (2 * query.intrinsics[:, 1, 1])),
-    )
-    return _pose_vector(relative, fov_rad)
+        reference_to_world = opengl_from_world_to_cam(reference.world_to_cam)
+        query_to_world = opengl_from_world_to_cam(query.world_to_cam)
+        relative = torch.linalg.inv(reference_to_world) @ query_to_world
+        relative[:, :3, 3] = 5.0 * torch.tanh(relative[:, :3, 3] / scale[:, None] / 10.0)
+        fov_rad = torch.minimum(
+            2 * torch.atan(query.width / (2 * query.intrinsics[:, 0, 0])),
+            2 * torch.atan(query.height / (2 * query.intrinsics[:, 1, 1])),
+        )
+        return _pose_vector(relative, fov_rad)
 
 
 def megascenes_pose(
