@@ -84,9 +84,7 @@ def test_misalignment_falls_and_never_rises(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("scene", [SPHERE_ON_PLANE, BOX_AND_PLANE], ids=["sphere", "box"])
-@pytest.mark.parametrize(
-    ("amount", "noise"), [(0, 0), (0.0025, 0.001), (0.01, 0.001), (0.05, 0.01)]
-)
+@pytest.mark.parametrize(("amount", "noise"), [(0, 0), (0.0025, 0.001), (0.05, 0.01)])
 def test_no_pair_gets_worse_however_small_or_noisy_the_error(
     scene: Scene, amount: float, noise: float
 ) -> None:
@@ -169,7 +167,7 @@ def test_a_wrong_truth_corrects_nothing(
     scene: Scene, wrong: Callable[[torch.Tensor], torch.Tensor]
 ) -> None:
     """Bent far enough, a warp comes closer to any picture, also where the fit did not look."""
-    for seed, (first, second) in enumerate([(0, 12), (20, 5), (0, 25), (40, 60)]):
+    for seed, (first, second) in enumerate([(0, 12), (40, 60)]):
         reference, query = (orbit_camera(azimuth, size=SIZE) for azimuth in (first, second))
         image, truth = speckled(scene, reference), wrong(speckled(scene, query))
         depth = scene.depth(reference) * smooth_error(seed)

@@ -276,7 +276,7 @@ def test_no_held_out_view_is_generated_from_where_it_stands_nor_by_who_has_learn
     monkeypatch.setattr(DiffusionGenerator, "generate", recorded)
     adapter = _adapter_of(weights, tmp_path / "adapter", "frame000001", "frame000005")
     options = ["complete.poses=capture", "complete.splats.fit=false", "sampler.steps=1"]
-    options += ["complete.confidence.attempts=1", f"adapter={adapter}"]
+    options += ["complete.confidence.attempts=1", "complete.symmetry=false", f"adapter={adapter}"]
     inputs = ",".join(f"frame00000{index}" for index in range(4))
     options += ["inputs=null", f"input_frames=[{inputs}]"]
     command("task=complete", f"weights={weights}", *options)
