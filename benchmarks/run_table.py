@@ -126,6 +126,9 @@ def _run(
     console.print(f"{len(jobs)} cells: {len(left.done)} reused, {still} open")
     for column, reason in missing_networks(jobs[0].scoring).items():
         console.print(f"{column} stays empty: {reason}")
+    for method, reason in sorted({(job.method.name, _missing_weights(job)) for job in jobs}):
+        if reason:
+            console.print(f"{method} stays empty: {reason}")
     if options.dry_run:
         print_plan(jobs, left, folder, console)
         return 0
@@ -233,13 +236,18 @@ def _launchers(
         yield partial(isolated.run, run_method), local
 
 
+def _missing_weights(job: CellJob) -> str:
+    """Why a cell's method has no weights; empty where it has them, or needs none."""
+    return job.made_from.inputs["weights"].partition(MISSING_WEIGHTS)[2]
+
+
 def print_plan(
     jobs: Sequence[CellJob], left: OpenJobs, folder: TableFolder, console: Console
 ) -> None:
-    """What would run, how long, and which weights a method lacks."""
+    """What would run, and how long."""
     known = _seconds_of_cells(folder)
     making, scoring = (known.groupby("method")[step].median() for step in ("making", "scoring"))
-    shown = Table("method", "cells", "to make", "to score", "seconds a cell", "missing")
+    shown = Table("method", "cells", "to make", "to score", "seconds a cell")
     total, unknown = 0.0, []
     for name in dict.fromkeys(job.method.name for job in jobs):
         mine, to_make, to_score = (
@@ -253,9 +261,7 @@ def print_plan(
         per_cell = np.nan_to_num([make_s, score_s])
         total += float(per_cell @ [len(to_make), len(to_make) + len(to_score)])
         rate = "not yet known" if math.isnan(make_s) else f"{per_cell.sum():.1f}"
-        weights = mine[0].made_from.inputs["weights"]
-        missing = weights.partition(MISSING_WEIGHTS)[2]
-        shown.add_row(name, *(str(len(part)) for part in (mine, to_make, to_score)), rate, missing)
+        shown.add_row(name, *(str(len(part)) for part in (mine, to_make, to_score)), rate)
     console.print(shown)
     duration = timedelta(seconds=round(total))
     said = [f"about {duration} (h:mm:ss) of one core"] if total or not unknown else []
