@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import roma
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -41,6 +42,8 @@ ONE_PLACE = 1e-6
 MIN_SHARE, NEARLY_ALL = 1 / 3, 0.9
 """Shares of cameras that look at one point: too few below the first, enough from the second on to
 name a convention."""
+SAME_FIT_RAD = np.deg2rad(0.5)
+"""Conventions between which the axes' distance from one point differs by less are both named."""
 CLEARLY_RAD = np.deg2rad(5)
 """Another convention fits only if the axes miss one point by more than this angle plus twice what
 they miss it by under that convention."""
@@ -162,6 +165,12 @@ def rotations_transposed(read: Float[Tensor, "*n 4 4"]) -> Float[Tensor, "*n 4 4
     return right
 
 
+def _placed(
+    rotation: Float[Tensor, "*n 3 3"], translation: Float[Tensor, "*n 3"]
+) -> Float[Tensor, "*n 4 4"]:
+    return roma.Rigid(rotation, translation).to_homogeneous()
+
+
 OPENGL_POSES = PoseConvention(
     "camera-to-world in OpenGL's axes (+X right, +Y up, −Z forward)",
     {
@@ -179,6 +188,15 @@ COLMAP_POSES = PoseConvention(
     {
         "camera-to-world": rigid_inverse,
         ROLLED: quaternions_rolled,
+        "world-to-camera with R transposed": lambda read: _placed(
+            read[..., :3, :3].mT, read[..., :3, 3]
+        ),
+        "world-to-camera rotations beside the cameras' positions": lambda read: _placed(
+            read[..., :3, :3], -(read[..., :3, :3] @ read[..., :3, 3:])[..., 0]
+        ),
+        "world-to-camera in OpenGL's axes (+Y up, −Z forward)": lambda read: (
+            read * read.new_tensor([1.0, -1.0, -1.0, 1.0])[:, None]
+        ),
     },
 )
 CO3D_POSES = PoseConvention(
@@ -232,7 +250,8 @@ def _likely_mistake(cameras: Camera, convention: PoseConvention) -> str:
             and angle_rad > 2 * angles_rad.mean() + CLEARLY_RAD
         ):
             fits[name] = float(angles_rad.mean())
-    return min(fits, key=lambda name: fits[name], default="")
+    as_well = min(fits.values(), default=0.0) + SAME_FIT_RAD
+    return " or ".join(name for name in sorted(fits, key=fits.__getitem__) if fits[name] <= as_well)
 
 
 def _extent(cameras: Camera) -> tuple[float, float]:

@@ -99,12 +99,12 @@ def read_model(model: Path, images: Path, name: str, upright: bool = False) -> F
             unusable.append(entry.fault or str(error))
         else:
             listed.append(Listed(path, partial(_photograph, entry, cameras, cameras_file, upright)))
+    # First: around the world's origin, poses alone fit several conventions, and points only one.
+    check_points(model, _sightings(entries, cameras, cameras_file))
     cloud = PointFile(model, POINT_CLOUD)
-    sequence = sequence_of_photographs(
+    return sequence_of_photographs(
         ListedFiles(images), name, listed, images_file, COLMAP_POSES, unusable, cloud
     )
-    check_points(model, _sightings(entries, cameras, cameras_file))
-    return sequence
 
 
 def _sightings(

@@ -66,9 +66,10 @@ def check_points(model: Path, sightings: Sequence[Sighting]) -> None:
         others = {name: _misfit(sightings, tracks, reread) for name, reread in mistakes.items()}
         best = min(others, key=lambda name: others[name])
         if given > _FAR and others[best] < _NEAR:
+            far = f"{given:.0%} of a picture's side from where its images show them"
             raise InputError(
-                f"{where} lie {given:.0%} of the picture's longer side from where its images show "
-                f"them, but {others[best]:.1%} if the poses are read as {best}; {belong}"
+                f"{where} lie {far if np.isfinite(given) else 'behind its cameras'}, but "
+                f"within {others[best]:.1%} of a side if the poses are read as {best}; {belong}"
             )
     elif len(points) >= _MIN_OBSERVATIONS and len(sightings) >= _MIN_IMAGES:
         some = points[:: -(-len(points) // _POINTS_COUNTED)]
@@ -105,7 +106,7 @@ def _misfit(sightings: Sequence[Sighting], tracks: Sequence[Track], reread: Rere
     for sighting, (places, pixels) in zip(sightings, tracks, strict=True):
         offset = _project(sighting, places, reread) - pixels
         errors.append(np.hypot(*offset.T) / max(sighting.height, sighting.width))
-    return float(np.median(np.nan_to_num(np.concatenate(errors), nan=np.inf)))
+    return float(np.median(np.nan_to_num(np.concatenate(errors), nan=np.inf, posinf=np.inf)))
 
 
 def _in_view(

@@ -46,19 +46,43 @@ def pixels(rotation, translation, points):
     return seen[:, :2] / seen[:, 2:] * FOCAL + [WIDTH / 2, HEIGHT / 2]
 
 
-def write(folder, cameras, points, kind="txt", order="wxyz", tracks=True, noise=0.3, outliers=0.2):
+MISTAKES = {
+    "camera-to-world": lambda rotation, translation: (rotation.T, -rotation.T @ translation),
+    "with R transposed": lambda rotation, translation: (rotation.T, translation),
+    "the cameras' positions": lambda rotation, translation: (rotation, -rotation.T @ translation),
+    "OpenGL's axes": lambda rotation, translation: (FLIP @ rotation, FLIP @ translation),
+}
+FLIP = np.diag([1.0, -1.0, -1.0])
+
+
+def right(rotation, translation):
+    return rotation, translation
+
+
+def write(
+    folder,
+    cameras,
+    points,
+    kind="txt",
+    order="wxyz",
+    tracks=True,
+    noise=0.3,
+    outliers=0.2,
+    written=right,
+):
     (folder / "images").mkdir()
     rng = np.random.default_rng(1)
     images = []
     for index, (rotation, translation) in enumerate(cameras):
         Image.new("RGB", (WIDTH, HEIGHT)).save(folder / "images" / f"{index}.png")
-        x, y, z, w = Rotation.from_matrix(rotation).as_quat()
+        stored, beside = written(rotation, translation)
+        x, y, z, w = Rotation.from_matrix(stored).as_quat()
         quaternion = (w, x, y, z) if order == "wxyz" else (x, y, z, w)
         seen = pixels(rotation, translation, points) + rng.normal(0, noise, (len(points), 2))
         wrong = rng.random(len(points)) < outliers
         seen[wrong] = rng.uniform(0, [WIDTH, HEIGHT], (wrong.sum(), 2))
         observed = [(*seen[i], i + 1 if i % 3 else -1) for i in range(len(points) * tracks)]
-        images.append((index + 1, (*quaternion, *translation), f"{index}.png", observed))
+        images.append((index + 1, (*quaternion, *beside), f"{index}.png", observed))
     (write_text if kind == "txt" else write_binary)(folder, images, points)
     return str(folder)
 
@@ -99,6 +123,15 @@ def test_quaternions_in_another_order_are_named_by_the_tracks(tmp_path, kind):
     with pytest.raises(InputError, match="quaternions in the order x, y, z, w") as caught:
         open_scene(spec)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("cameras", [circle, row])
+@pytest.mark.parametrize("name", MISTAKES)
+def test_poses_in_another_convention_are_named(tmp_path, name, cameras):
+    points = CLOUD if cameras is circle else CLOUD + AHEAD
+    spec = write(tmp_path, cameras(), points, written=MISTAKES[name])
+    with pytest.raises(InputError, match=name):
+        open_scene(spec)
 
 
 def test_quaternions_in_another_order_are_named_by_points_out_of_sight(tmp_path):
