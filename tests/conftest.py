@@ -140,6 +140,18 @@ def rendered_once() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="module")
+def coarse_results() -> Iterator[None]:
+    """Of a completed scene few frames of its film, few cells of its mesh, and few points of the
+    truth that it is scored against.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("extrap_train.reconstruction.cloud_pictures.TURN_FRAMES", 4)
+        patch.setattr("extrap_train.reconstruction.map_scores.DENSE_POINTS", 30_000)
+        patch.setattr("extrap_train.reconstruction.mesh._CELL", 0.02)
+        yield
+
+
 @pytest.fixture
 def measured_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """An adaptation's held-out pairs at one level, with one noise: what follows from their error is

@@ -48,8 +48,8 @@ def _finish(output: Path, *more: str, status: int = 0) -> str:
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _rendered_once(rendered_once: None) -> None:
-    """See `rendered_once`."""
+def _rendered_once(rendered_once: None, coarse_results: None) -> None:
+    """See both."""
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,7 @@
 """One scene on the command line: a tiny model, and the commands that work on the scene with it."""
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -26,13 +26,8 @@ def _rendered_once(rendered_once: None) -> None:
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _coarse_results() -> Iterator[None]:
-    """What is drawn and measured of a completed scene, by fewer numbers."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("extrap_train.reconstruction.cloud_pictures.TURN_FRAMES", 4)
-        patch.setattr("extrap_train.reconstruction.map_scores.DENSE_POINTS", 1000)
-        patch.setattr("extrap_train.reconstruction.mesh._CELL", 0.02)
-        yield
+def _coarse_results(coarse_results: None) -> None:
+    """See `coarse_results`."""
 
 
 @pytest.fixture(scope="session")

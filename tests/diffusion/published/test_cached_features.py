@@ -190,7 +190,7 @@ def test_the_commands_encode_and_train(
         *TINY_MODEL[2:],
         "data.train_sequences=1",
         "data.test_sequences=1",
-        "data.frames=12",
+        "data.frames=8",
         "data.image_size=32",
         "prep.max_gap_deg=60",
         "prep.correct=false",
@@ -209,9 +209,9 @@ def test_the_commands_encode_and_train(
     ]
     monkeypatch.setattr(sys, "argv", ["data_prep", *shared, "workers=1"])
     data_prep.main()
-    assert "12 frames encoded" in capsys.readouterr().out
+    assert "8 frames encoded" in capsys.readouterr().out
     sizes = [file.stat().st_size for file in tmp_path.rglob("features_64_*/**/*.npy")]
-    assert sum(sizes) < 12 * 2 * 2 * (2 * 4 * 8 * 8 + 768) + 500
+    assert sum(sizes) < 8 * 2 * 2 * (2 * 4 * 8 * 8 + 768) + 500
     monkeypatch.setattr(sys, "argv", ["extrap_train", *shared, *training])
     main()
     assert "encoded before" in capsys.readouterr().out
