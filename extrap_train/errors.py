@@ -59,7 +59,9 @@ def ends_in_one_line() -> Iterator[None]:
                 yield
             sys.stdout.flush()  # report a failure here, not while the interpreter exits
         except InputError as error:
-            raise _end(1, f"error: {error}") from None
+            # A DataLoader raises what a worker raised with its traceback in front of the message.
+            _, _, message = str(error).rpartition(f"{__name__}.InputError: ")
+            raise _end(1, f"error: {message.rstrip()}") from None
         except KeyboardInterrupt as stopped:
             # After an interrupt within code from a string, as dataclasses are made of, `python -m`
             # would end by the signal; the next such code that ends takes that back.

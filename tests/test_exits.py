@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from torch._utils import ExceptionWrapper
 
 from extrap_train.errors import InputError, ends_in_one_line
 
@@ -30,10 +31,19 @@ def _terminated_with_advice() -> None:
         raise KeyboardInterrupt("kept step 3") from None
 
 
+def _raised_by_a_loader() -> None:
+    try:
+        _raise(InputError("frames.npy: is damaged"))
+    except InputError:
+        wrapped = ExceptionWrapper(where="in DataLoader worker process 0")
+    wrapped.reraise()
+
+
 @pytest.mark.parametrize(
     ("end", "status", "line"),
     [
         (lambda: _raise(InputError("no such folder")), 1, "error: no such folder"),
+        (_raised_by_a_loader, 1, "error: frames.npy: is damaged"),
         (lambda: _raise(KeyboardInterrupt()), 130, "interrupted: run the same command again"),
         (lambda: _raise(KeyboardInterrupt("kept step 3")), 130, "interrupted: kept step 3"),
         (lambda: os.kill(os.getpid(), signal.SIGINT), 130, "interrupted: "),
