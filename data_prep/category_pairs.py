@@ -60,14 +60,16 @@ def prepare_category(
     output: Path,
     workers: int | None,
     matcher: MatcherConfig,
+    poses: MatcherConfig | None = None,
     launcher: LauncherConfig = LOCAL,
     retry: bool = False,
 ) -> PreparedData:
     """Sequences of one category as pairs on disk; what is there already is used again.
 
-    `workers` are local processes, by default `PrepModels.default_workers`. With `retry`, sequences
-    that failed before are tried again. Paths are followed to where they lead, so that other
-    spellings of one are the same preparation.
+    `poses` says whose matches place photographs that have no cameras, by default SIFT's. `workers`
+    are local processes, by default `PrepModels.default_workers`. With `retry`, sequences that
+    failed before are tried again. Paths are followed to where they lead, so that other spellings
+    of one are the same preparation.
     """
     data, depth, matcher = resolve_paths(data), resolve_paths(depth), resolve_paths(matcher)
     how = matcher if is_corrected(data, depth, prep) else None
@@ -87,7 +89,7 @@ def prepare_category(
         _alone(folder.parent / f".{category}.lock"),
         open_launcher(launcher, workers, folder.parent / "slurm") as opened,
     ):
-        sequences, test_names = _sequences(category, data, depth, output, opened)
+        sequences, test_names = _sequences(category, data, depth, poses, output, opened)
         return prepare(
             sequences,
             depth,
@@ -127,6 +129,7 @@ def prepare_members(
             output=Path(config.output),
             workers=workers,
             matcher=config.matcher,
+            poses=config.poses,
             launcher=launcher,
             retry=retry,
         )
@@ -187,7 +190,12 @@ def _alone(lock: Path) -> Iterator[None]:
 
 
 def _sequences(
-    category: str, data: DataConfig, depth: DepthConfig, output: Path, launcher: Launcher
+    category: str,
+    data: DataConfig,
+    depth: DepthConfig,
+    poses: MatcherConfig | None,
+    output: Path,
+    launcher: Launcher,
 ) -> tuple[list[FrameSequence], set[str] | int]:
     if isinstance(data, SyntheticConfig):
         root = Path(data.root) if data.root else output / "synthetic"
@@ -201,7 +209,7 @@ def _sequences(
         return uco3d.read_category(root, category), data.test_sequences
     if isinstance(data, FoldersConfig):
         needs_depth = isinstance(depth, DatasetDepthConfig)
-        captures = capture_folders.read_category(root, category, needs_depth=needs_depth)
+        captures = capture_folders.read_category(root, category, poses, needs_depth=needs_depth)
         return captures, data.test_sequences
     assert isinstance(data, Co3dConfig)
     sequences = co3d.read_category(root, category)

@@ -241,6 +241,8 @@ class DataPrepConfig:
     data: DataConfig = MISSING
     depth: DepthConfig = MISSING
     matcher: MatcherConfig = MISSING
+    poses: MatcherConfig = MISSING
+    """Whose matches place photographs that come without cameras (`data=folders`)."""
     launcher: LauncherConfig = MISSING
     model: ModelConfig | None = None
     """Whose frozen networks encode every training frame once, for trainer.latents=cached."""

@@ -7,6 +7,7 @@ import logging
 from dataclasses import replace
 from pathlib import Path
 
+from extrap_train.config import MatcherConfig
 from extrap_train.data.archives import is_archive
 from extrap_train.data.estimated_poses import find_pictures
 from extrap_train.data.scene_spec import open_scene
@@ -37,17 +38,19 @@ def require_category(root: Path, category: str) -> None:
     raise InputError(f"{root / category}: holds no folder, archive or video of a capture; add some")
 
 
-def read_category(root: Path, category: str, *, needs_depth: bool = False) -> list[FrameSequence]:
+def read_category(
+    root: Path, category: str, poses: MatcherConfig | None = None, *, needs_depth: bool = False
+) -> list[FrameSequence]:
     """The captures of a category, by name; cameras are estimated where there are none.
 
-    A capture that cannot be read is left out with a warning. InputError where all are. For
-    `needs_depth`, see `open_scene`.
+    A capture that cannot be read is left out with a warning. InputError where all are. For `poses`
+    and `needs_depth`, see `open_scene`.
     """
     require_category(root, category)
     found, faults = [], []
     for entry in _entries(root / category):
         try:
-            sequence = open_scene(str(entry), needs_depth=needs_depth)
+            sequence = open_scene(str(entry), poses=poses, needs_depth=needs_depth)
         except InputError as fault:
             log.warning("%s is left out: %s", entry, fault)
             faults.append(str(fault))

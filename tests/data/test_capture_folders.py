@@ -9,7 +9,8 @@ from complaints import complaint_of
 from PIL import Image
 from posed_folders import write_transforms
 
-from data_prep.category_pairs import prepare_category
+from data_prep.category_pairs import prepare_category, prepare_members
+from extrap_train.cli import PREP, TRAIN, compose_config
 from extrap_train.config import (
     DatasetDepthConfig,
     FlowMatcherConfig,
@@ -19,6 +20,7 @@ from extrap_train.config import (
 from extrap_train.data import scene_spec
 from extrap_train.data.capture_folders import read_category, require_category
 from extrap_train.data.scene_spec import open_scene
+from extrap_train.errors import InputError
 
 
 @pytest.fixture
@@ -76,6 +78,25 @@ def test_depth_that_photographs_cannot_bring_is_refused_before_cameras_are_estim
     assert "depth=stereo" in said
     prepare = (FoldersConfig(root=str(tmp_path)), DatasetDepthConfig(), PrepConfig())
     assert "depth=stereo" in complaint_of(lambda: _prepare(tmp_path, *prepare))
+
+
+@pytest.mark.parametrize("command", [TRAIN, PREP], ids=["train", "prep"])
+def test_photographs_without_cameras_are_placed_by_the_chosen_matches(
+    command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = []
+
+    def place(*arguments):
+        given.append(arguments[-1])
+        raise InputError("not placed")
+
+    monkeypatch.setattr(scene_spec, "read_unposed", place)
+    _write_photographs(tmp_path / "apple" / "one")
+    chosen = ["poses=aliked", "poses.checkpoint=a.pth", "depth=stereo", f"output={tmp_path}"]
+    words = ["category=apple", "data=folders", f"data.root={tmp_path}", *chosen]
+    with pytest.raises(InputError, match="not placed"):
+        list(prepare_members(compose_config(command, words), workers=1))
+    assert [(poses.name, poses.checkpoint) for poses in given] == [("aliked", "a.pth")]
 
 
 def test_they_are_prepared_for_training_with_one_held_out(root: Path) -> None:
