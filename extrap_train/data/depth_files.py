@@ -12,6 +12,7 @@ from torch import Tensor
 
 from extrap_train.data.image_files import (
     MAX_PIXELS,
+    NO_DEPTH_16_BIT,
     nearest_pixels,
     read_grey,
     read_picture,
@@ -29,8 +30,6 @@ ARRAY_ERRORS = (
 MAX_DEPTH_SCALE = 1e6
 """Scene units per unit of a depth file; a larger one is damage."""
 
-_NO_DEPTH_16_BIT = 65_535
-"""What sensors write where they measured nothing, or more than sixteen bits can say."""
 _SIXTEEN_BIT_MODES = ("I;16", "I;16B")
 _DEPTH_MODES = (*_SIXTEEN_BIT_MODES, "I", "F")
 
@@ -79,7 +78,7 @@ class DepthFile:
             depth = raw.astype(np.float32) * np.float32(self.scale)
         depth[~(np.isfinite(depth) & (depth > 0))] = 0
         if raw.dtype.kind == "u" and raw.dtype.itemsize == 2:
-            depth[raw == _NO_DEPTH_16_BIT] = 0
+            depth[raw == NO_DEPTH_16_BIT] = 0
         if not depth.any():
             raise InputError(
                 f"{path}: the depth map is zero everywhere; remove it or its frame, or estimate "

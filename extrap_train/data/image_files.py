@@ -34,6 +34,8 @@ DECODER_ERRORS = (
     *(struct.error, AttributeError, Image.DecompressionBombError),
 )
 """What Pillow's decoders raise on damaged files."""
+NO_DEPTH_16_BIT = 65_535
+"""What sensors write where they measured nothing, or more than sixteen bits can say."""
 BACKGROUND = 255
 """What a photograph shows where it is transparent: white, whatever colour is hidden there."""
 _MIN_PURE = 0.9

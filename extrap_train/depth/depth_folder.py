@@ -12,7 +12,12 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from extrap_train.data.image_files import MAX_PIXELS, image_size, read_picture
+from extrap_train.data.image_files import (
+    MAX_PIXELS,
+    NO_DEPTH_16_BIT,
+    image_size,
+    read_picture,
+)
 from extrap_train.data.paths import require_file
 from extrap_train.errors import InputError
 from extrap_train.views import Camera
@@ -41,9 +46,9 @@ class StoredDepth:
 
     file: Path
     depth: Float[Tensor, "h w"]
-    """As it is stored, but 0 where it is not finite."""
+    """As it is stored, but 0 where it is unknown."""
     confidence: Float[Tensor, "h w"]
-    """0 to 1; 1 everywhere if the file has none."""
+    """0 to 1; 0 where depth is unknown, and 1 elsewhere if the file has none."""
     intrinsics: Float[Tensor, "3 3"] | None = None
     """At the size of the map."""
     world_to_cam: Float[Tensor, "4 4"] | None = None
@@ -71,6 +76,8 @@ def read_depth_file(file: Path) -> StoredDepth:
     arrays = {"depth": _read_png(file)} if file.suffix == ".png" else _read_arrays(file)
     if "depth" not in arrays:
         raise InputError(f"{file}: has no array `depth`; write one")
+    is_known = np.isfinite(arrays["depth"])
+    arrays = {name: np.where(np.isfinite(values), values, 0) for name, values in arrays.items()}
     depth = arrays["depth"]
     confidence = arrays.get("confidence", np.ones(depth.shape, np.float32))
     shapes = {"confidence": depth.shape, "intrinsics": (3, 3), "world_to_cam": (4, 4)}
@@ -87,6 +94,8 @@ def read_depth_file(file: Path) -> StoredDepth:
             f"{file}: `confidence` is {confidence.min():.3g} to {confidence.max():.3g}, and must "
             "be 0 to 1; rescale it or leave it out"
         )
+    # Inverse depth may be 0 where it is known, so that 0 alone does not say unknown.
+    confidence = confidence * is_known
     camera = {name: _matrix(arrays[name], name, file) for name in [*shapes][1:] if name in arrays}
     return StoredDepth(file, torch.from_numpy(depth), torch.from_numpy(confidence), **camera)
 
@@ -142,9 +151,11 @@ def _matrix(values: Shaped[np.ndarray, "n n"], name: str, file: Path) -> Float[T
 
 
 def _read_png(file: Path) -> Float[np.ndarray, "h w"]:
+    """NaN where sensors write that they measured nothing."""
     size = image_size(file)
     picture = read_picture(file, size, ("I;16", "I;16B", "I"), resize=False)
-    return np.asarray(picture).astype(np.float32)
+    values = np.asarray(picture).astype(np.float32)
+    return np.where(values == NO_DEPTH_16_BIT, np.float32(np.nan), values)
 
 
 def _read_arrays(file: Path) -> dict[str, Float[np.ndarray, "..."]]:
@@ -169,7 +180,8 @@ def _read_arrays(file: Path) -> dict[str, Float[np.ndarray, "..."]]:
 def _read_array(stream: IO[bytes]) -> Float[np.ndarray, "..."]:
     """Numbers of an NPY stream in single precision; ValueError unless the header is plausible.
 
-    No more is read than the header says, and never more than `MAX_PIXELS` numbers.
+    They need not be finite. No more is read than the header says, and never more than
+    `MAX_PIXELS` numbers.
     """
     read_header = {
         (1, 0): np.lib.format.read_array_header_1_0,
@@ -184,5 +196,4 @@ def _read_array(stream: IO[bytes]) -> Float[np.ndarray, "..."]:
         raise ValueError(f"{len(content)} bytes instead of {count * dtype.itemsize}")
     values = np.frombuffer(content, dtype).reshape(shape, order="F" if is_fortran else "C")
     with np.errstate(invalid="ignore", over="ignore"):
-        numbers = np.squeeze(values).astype(np.float32)
-    return np.ascontiguousarray(np.where(np.isfinite(numbers), numbers, 0))
+        return np.ascontiguousarray(np.squeeze(values).astype(np.float32))

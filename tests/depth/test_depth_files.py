@@ -144,6 +144,25 @@ def test_pictures_in_millimetres_and_plain_arrays(tmp_path, views, kind):
     assert len(weight_files(FilesDepthConfig(folder=str(tmp_path)))) == 3
 
 
+@pytest.mark.parametrize("align", ["scene", "affine"])
+@pytest.mark.parametrize("kind", ["png", "npz"])
+def test_what_a_sensor_did_not_measure_is_unknown(tmp_path, views, kind, align):
+    for view in views:
+        values = (20_000 / view.depth if align == "affine" else 1000 * view.depth).round().numpy()
+        if kind == "png":
+            values = values.astype(np.uint16)
+        values[:20] = 65_535 if kind == "png" else np.nan
+        file = write(tmp_path, view, values)
+        if kind == "png":
+            file.unlink()
+            Image.fromarray(values).save(file.with_suffix(".png"))
+    for found, view in zip(source(tmp_path, align=align).depth_maps(views), views, strict=True):
+        assert not found.reliable()[:20].any()
+        known = found.reliable()[20:]
+        assert (known > 0).float().mean() > 0.9
+        assert float((known / view.depth[20:] - 1).abs()[known > 0].median()) < 0.02
+
+
 def _wrong(view):
     k, pose = view.camera.intrinsics.clone(), view.camera.world_to_cam.clone()
     long, off, moved, turned = k.clone(), k.clone(), pose.clone(), pose.clone()
