@@ -9,6 +9,7 @@ default chosen on, three one-sided inputs with exact depth, pictures of the pack
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -23,7 +24,7 @@ from extrap_train.depth.stereo import PlaneSweepStereo
 from extrap_train.diffusion.generator import DiffusionGenerator
 from extrap_train.geometry.cameras import WorldFrame
 from extrap_train.geometry.viewpoints import directions_from, scene_center
-from extrap_train.metrics import psnr
+from extrap_train.metrics import psnr, squeeze_lpips
 from extrap_train.reconstruction.cloud import cloud_of
 from extrap_train.reconstruction.completion import (
     CompletionPipeline,
@@ -45,12 +46,18 @@ from extrap_train.reconstruction.symmetry import find_symmetries, mirrored_photo
 from extrap_train.tasks.completion_results import SUBDIVIDE
 from extrap_train.tasks.scene_model import open_model
 from extrap_train.views import View, stack_cameras, stack_poses
+from tests.reconstruction.pictures_from_behind import (
+    Distance,
+    pictures_without_model,
+    score_pictures,
+)
 
 CATEGORIES = ("apple", "book", "chair", "cup", "hydrant", "teddybear")
 CAPTURES = SyntheticConfig(seed=917, frames=24, image_size=128)
 NUMBERS = (4, 5, 6, 7)
 WITHIN = 0.02
 ANGLES_DEG = (60, 110, 180)
+BEHIND_DEG = 90
 
 
 @dataclass(frozen=True)
@@ -151,6 +158,27 @@ def generated_views(capture: Capture, known: GlobalMap) -> list[GeneratedView]:
     return found
 
 
+def scores_from_behind(
+    capture: Capture, maps: dict[str, GlobalMap], lpips: Distance
+) -> list[dict[str, str | float]]:
+    """`score_pictures` of the views of some maps, all at the same cameras, that are at least
+    `BEHIND_DEG` from every input, and of what needs no model.
+    """
+    rows = []
+    for made in generated_views(capture, maps["without"]):
+        if made.angle_deg >= BEHIND_DEG:
+            like = made.view.view
+            pictures = {name: view_named(known, like.name) for name, known in maps.items()}
+            pictures |= pictures_without_model(capture.inputs, like)
+            rows += score_pictures(capture.scene, capture.world, pictures, lpips)
+    return rows
+
+
+def view_named(known: GlobalMap, name: str) -> View:
+    """The view of the map that has this name."""
+    return next(view.view for view in known.views if view.view.name == name)
+
+
 def shown_by(known: GlobalMap, view: View) -> torch.Tensor:
     """Pixels of the view's surface that some view of the map shows."""
     _, added = known.added(view, torch.ones_like(view.depth), known.views[0].origin)
@@ -212,21 +240,25 @@ def test_pictures_generated_from_the_photographs_alone_show_more_of_the_object()
 
 @pytest.mark.slow
 @pytest.mark.parametrize("is_exact", [True, False], ids=["exact", "stereo"])
-def test_mirrored_photographs_close_the_scene(is_exact: bool) -> None:
+def test_mirrored_photographs_close_the_scene(is_exact: bool, shared: Path) -> None:
     """Completed with and without the object's symmetry, depths fused, depth of the inputs exact or
-    stereo's: scores of the cloud, and depth and picture of the object's pixels that no input shows.
+    stereo's: scores of the cloud, depth and picture of the object's pixels that no input shows, and
+    pictures of the object from behind.
     """
-    rows = []
+    lpips = squeeze_lpips(str(shared / "weights/lpips_squeeze.pt"))
+    rows, behind = [], []
     for category in CATEGORIES:
         for number in NUMBERS:
             capture = Capture.open(category, number, is_exact=is_exact)
             found = find_symmetries(capture.inputs)
             mirrored = mirrored_photographs(capture.inputs, found)
+            maps: dict[str, GlobalMap] = {}
             for name, views in (("without", ()), ("mirrored", mirrored)):
                 if name == "mirrored" and not found:
                     rows.append(rows[-1] | {"inputs": name})
+                    maps[name] = maps["without"]
                     continue
-                known = fuse_depths(capture.completed(None, mirrored=views))
+                maps[name] = known = fuse_depths(capture.completed(None, mirrored=views))
                 made = [x for x in generated_views(capture, known) if x.hidden.any()]
                 errors = np.concatenate([x.errors()[0] for x in made])
                 squares = [
@@ -248,10 +280,20 @@ def test_mirrored_photographs_close_the_scene(is_exact: bool) -> None:
                     | capture.scores(known)
                 )
                 print(f"\n{category} {number}", rows[-1], flush=True)
+            behind += [
+                {"capture": f"{category} {number}"} | row
+                for row in scores_from_behind(capture, maps, lpips)
+            ]
     table = pd.DataFrame(rows)
     print(table.groupby(["category", "inputs"]).mean().round(3).to_string())
     means = table.drop(columns="category").groupby("inputs").mean()
     print(means.round(4).T.to_string())
+    pictures = pd.DataFrame(behind).groupby(["picture", "capture"]).mean()
+    print(pictures.groupby("picture").mean().round(3).to_string())
+    for name in ("without", "nearest photograph", "inpainted warp"):
+        gain = (pictures.loc["mirrored"] - pictures.loc[name]).dropna(axis=1)
+        half = 2 * gain.std() / len(gain) ** 0.5
+        print(f"mirrored against {name}:", gain.mean().round(3).to_dict(), half.round(3).to_dict())
     assert means["f_score"]["mirrored"] > means["f_score"]["without"] + 0.02
 
 
