@@ -20,7 +20,9 @@ from extrap_train.gaussians.gaussian_model import Gaussians
 from extrap_train.store.atomic import write_atomic
 
 _EPSILON = 1e-6
-"""Opacities are kept this far from 0 and 1, and scales above it, whose logits are infinite."""
+"""Opacities are kept this far from 0 and 1, whose logits are infinite."""
+_LEAST_SCALE = float(torch.finfo(torch.float32).tiny)
+"""The logarithm of 0 is infinite. No other size is too small: worlds have any unit."""
 _DEGREES = range(4)
 
 
@@ -33,7 +35,7 @@ def write_splats(path: Path, gaussians: Gaussians, comments: Sequence[str] = ())
         dc,
         rest,
         gaussians.opacities.clamp(_EPSILON, 1 - _EPSILON).logit()[:, None],
-        gaussians.scales.clamp(min=_EPSILON).log(),
+        gaussians.scales.clamp(min=_LEAST_SCALE).log(),
         functional.normalize(gaussians.quats, dim=-1),
     ]
     table = torch.cat(columns, 1).detach().cpu().numpy().astype("<f4")

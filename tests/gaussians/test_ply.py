@@ -1,5 +1,7 @@
 """PLY files hold what viewers expect, come back as they were, and bad ones are named."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -22,6 +24,16 @@ def test_comes_back_as_it_was(tmp_path, degree):
     assert torch.allclose(back.opacities, gaussians.opacities, atol=1e-6)
     unit = gaussians.quats / gaussians.quats.norm(dim=1, keepdim=True)
     assert torch.allclose(back.quats, unit, atol=1e-6)
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e9])
+def test_worlds_of_any_unit_come_back(tmp_path, unit):
+    gaussians = random_gaussians(20, 0)
+    scaled = replace(gaussians, means=unit * gaussians.means, scales=unit * gaussians.scales)
+    write_splats(tmp_path / "s.ply", scaled)
+    back = read_splats(tmp_path / "s.ply")
+    assert torch.allclose(back.scales / unit, gaussians.scales, rtol=1e-4)
+    assert torch.allclose(back.means / unit, gaussians.means)
 
 
 def test_layout_is_that_of_the_viewers(tmp_path):

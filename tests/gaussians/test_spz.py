@@ -1,7 +1,10 @@
 """SPZ files hold the Gaussians of the PLY file, as the library reads them back."""
 
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from torch.nn import functional
@@ -40,6 +43,20 @@ def test_they_are_read_back_within_the_formats_steps(tmp_path: Path, unit: float
     dc, rest = torch.from_numpy(read.sh0), torch.from_numpy(read.shN)
     assert torch.allclose(dc, written.sh[:, 0], atol=0.5 / (0.15 * 255) + 1e-4)
     assert torch.allclose(rest, written.sh[:, 1:], atol=0.5 / 128 + 1e-4)
+
+
+@pytest.mark.parametrize(("widest", "warns"), [(1e-6, True), (1e-3, False), (1e3, True)])
+def test_sizes_that_the_format_cannot_hold_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog, widest: float, warns: bool
+) -> None:
+    scales = np.log(np.array([[1e-9, 1e-9, widest]] * 9, np.float32))  # flat: thin everywhere
+    splats = SimpleNamespace(means=np.zeros((9, 3), np.float32), scales=scales)
+    library = SimpleNamespace(
+        plyread=lambda _: splats, write_spz=lambda path, *_, **__: Path(path).write_bytes(b"spz")
+    )
+    monkeypatch.setitem(sys.modules, "gsply", library)
+    spz.write_spz(tmp_path / "a.ply", tmp_path / "a.spz")
+    assert ("splats.ply" in caplog.text) == warns
 
 
 def test_it_is_refused_at_the_door_without_the_library(monkeypatch: pytest.MonkeyPatch) -> None:
