@@ -19,7 +19,12 @@ LONGEST = 1024
 
 
 def write_photographs(scene: str, folder: str, *names: str) -> None:
-    """Write `FOLDER/PATH.npz` for every photograph, or for those of these names."""
+    """Write `FOLDER/PATH.npz` for every photograph, or for those of these names.
+
+    InputError where the folder holds such files: a network would see those photographs, too.
+    """
+    if any(Path(folder).rglob("*.npz")):
+        raise InputError(f"{folder}: holds photographs already; remove it or give another folder")
     frames = {frame.name: frame for frame in open_scene(scene).frames}
     if unknown := [name for name in names if name not in frames]:
         raise InputError(f"{scene}: has no frame {unknown[0]}; {did_you_mean(unknown[0], frames)}")

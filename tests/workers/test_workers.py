@@ -271,8 +271,10 @@ def test_photographs_are_chosen_by_name(scene, tmp_path, load):
     write = load("write_photographs").write_photographs
     write(str(scene), str(tmp_path), "001.png")
     assert [path.name for path in tmp_path.rglob("*.npz")] == ["001.npz"]
+    with pytest.raises(InputError, match="another folder"):  # a network would see both
+        write(str(scene), str(tmp_path), "002.png")
     with pytest.raises(InputError, match="nine"):
-        write(str(scene), str(tmp_path), "nine.png")
+        write(str(scene), str(tmp_path / "new"), "nine.png")
 
 
 def test_photographs_of_several_sizes_are_refused(tmp_path, load):
