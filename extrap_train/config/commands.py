@@ -195,7 +195,7 @@ TASKS = {
 """What each value of `task=` does."""
 PAIR_TASKS = ("category", "validate")
 """Tasks that prepare pairs of photographs."""
-ANY_CATEGORY_TASKS = ("convert",)
+ANY_CATEGORY_TASKS = ("check", "convert")
 """Tasks that have nothing to do with a category, so that none has to be given."""
 
 

@@ -10,6 +10,7 @@ from extrap_train.reconstruction.check_picture import draw_check
 from extrap_train.store.manifest import claim
 from extrap_train.tasks.scene_inputs import (
     label_of,
+    nothing_kept,
     open_sequence,
     result_folder,
     scene_manifest,
@@ -23,6 +24,11 @@ MIN_VIEWS = 3
 
 def run(config: TrainConfig) -> None:
     """Draw `check.png`, replacing an earlier one, and print one line for each thing found."""
+    with nothing_kept():
+        _check(config)
+
+
+def _check(config: TrainConfig) -> None:
     sequence = open_sequence(config, with_depth=False)
     count = config.inputs or min(len(sequence.frames), MAX_VIEWS)
     chosen = select_input_frames(sequence, config.input_frames, count)
@@ -45,7 +51,7 @@ def run(config: TrainConfig) -> None:
         f"{pixels:.2f} px" if math.isfinite(pixels) else "an unknown distance"
         for pixels in check.residuals
     )
-    console.print(f"poses: {sequence.poses or 'the data set'}", markup=False)
+    console.print(f"poses: {sequence.poses or 'the data set'}")
     console.print(
         f"median residuals: matches lie {distance} from their epipolar lines, points of two views "
         f"{reprojection} from where a third has them"

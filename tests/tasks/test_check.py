@@ -10,7 +10,7 @@ from extrap_train.__main__ import main
 
 def test_a_check_draws_its_picture_each_time(tmp_path):
     write_transforms(tmp_path / "garden", [view_at(10 * k) for k in range(3)])
-    command = ["task=check", "category=cup", f"scene={tmp_path}/garden", f"output={tmp_path}/out"]
+    command = ["task=check", f"scene={tmp_path}/garden", f"output={tmp_path}/out"]
     said = run_command(main, *command)
     picture = tmp_path / "out" / "check" / "garden" / "check.png"
     assert said.endswith(f"result: {picture}\n")
