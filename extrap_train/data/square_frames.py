@@ -40,7 +40,7 @@ class CaptureKeys:
     """Hashes that tell captures apart without reading any photograph."""
 
     content: str
-    """Digest of names and cameras: the same wherever the capture lies."""
+    """Digest of names, cameras and how files are read: the same wherever the capture lies."""
     files: str
     """Digest of sizes and times of the photographs, masks and depth maps."""
     sizes: str
@@ -52,7 +52,7 @@ class CaptureKeys:
         content, files, sizes = hashlib.sha256(), hashlib.sha256(), hashlib.sha256()
         for frame in sequence.frames:
             traits = [frame.name, frame.camera.height, frame.camera.width, frame.has_depth]
-            content.update(json.dumps([*traits, frame.has_mask]).encode())
+            content.update(json.dumps([*traits, frame.has_mask, frame.reading]).encode())
             content.update(frame.camera.world_to_cam.numpy(force=True).tobytes())
             content.update(frame.camera.intrinsics.numpy(force=True).tobytes())
             stamps = [file_stamp(file) for file in frame.files]

@@ -1,5 +1,6 @@
 """Captures of one's own, `data=folders`: a folder per category, an entry per capture."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -104,6 +105,21 @@ def test_they_are_prepared_for_training_with_one_held_out(root: Path) -> None:
     prepared = _prepare(root, FoldersConfig(root=str(root)), DatasetDepthConfig(), prep)
     assert sorted(prepared.roles) == ["mug/blue", "mug/red"]
     assert sorted(prepared.roles.values()) == ["test", "train"]
+
+
+@pytest.mark.parametrize("key", ["depth_unit_scale_factor", "p1"])
+def test_a_corrected_unit_of_depth_or_lens_is_prepared_again(root: Path, key: str, capsys) -> None:
+    prep = PrepConfig(image_size=32, correct=False)
+    options = (FoldersConfig(root=str(root)), DatasetDepthConfig(), prep)
+    before = _prepare(root, *options)
+    file = root / "mug" / "blue" / "transforms.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {key: 0.002}))
+    after = _prepare(root, *options)
+    assert before.manifest["key"] != after.manifest["key"]
+    assert before.manifest["files"] != after.manifest["files"]
+    capsys.readouterr()
+    _prepare(root, *options)
+    assert "prepared already" in capsys.readouterr().out
 
 
 def _prepare(root, data, depth, prep):
