@@ -35,7 +35,8 @@ KNOWN_FORMS = (
 _CAMERA_FILES = (
     TRANSFORMS,
     *(f"{name}.{kind}" for name in ("cameras", "images") for kind in ("bin", "txt")),
-    *("poses_bounds.npy", "cameras.xml", "cameras.csv"),
+    *(f"transforms_{part}.json" for part in ("train", "val", "test")),
+    *("poses_bounds.npy", "cameras.xml", "cameras.csv", "cameras.json", "cameras.npz"),
 )
 
 

@@ -206,6 +206,8 @@ def test_a_failing_process_is_one_line(tmp_path, monkeypatch):
         "sparse/0/cameras.bin",
         "colmap/sparse/0/cameras.txt",
         "Transforms.json",
+        "transforms_train.json",
+        "cameras.npz",
         "poses_bounds.npy",
         "../frame_annotations.jgz",
     ],
