@@ -26,7 +26,8 @@ from extrap_train.diffusion.model import ExtrapolationModel
 from extrap_train.diffusion.model_files import save_model
 from extrap_train.views import View
 from tests.benchmarks.split_folders import write_split
-from tests.captures import write_capture
+from tests.captures import view_at, write_capture
+from tests.posed_folders import write_transforms
 
 TABLES = Catalogue().names("table")
 
@@ -81,6 +82,9 @@ def _table(name: str, tmp_path: Path) -> TableConfig:
         write_split(tmp_path / "data", 32, 8)
     elif source == "co3d":
         write_capture(tmp_path / "data", ("one",), frames=12, size=32)
+        words += ["captures.categories=[cup]"]
+    elif source == "folders":
+        write_transforms(tmp_path / "data" / "cup" / "one", [view_at(30 * i) for i in range(12)])
         words += ["captures.categories=[cup]"]
     else:
         words += ["captures.categories=[hydrant]", "captures.frames=10", "captures.render_size=32"]
