@@ -22,6 +22,7 @@ from benchmarks.run.identity import (
 )
 from extrap_train.config import DepthConfig, MethodConfig, TableConfig
 from extrap_train.data.frame_files import sequence_folder
+from extrap_train.data.square_frames import CaptureKeys
 from extrap_train.depth.sources import weight_files
 from extrap_train.errors import InputError
 from extrap_train.store.digests import file_digest, json_digest
@@ -138,8 +139,9 @@ def prepare_draws(
     made_by = [preparing_code(), asdict(table.captures), asdict(table.rules)]
     made_by += [asdict(depth), {str(file): file_digest(file) for file in files}]
     for draw in draws:
-        origin = json_digest([*made_by, asdict(draw)])
         capture = by_name[draw.category, draw.sequence]
+        shown = CaptureKeys.of(capture.sequence)
+        origin = json_digest([*made_by, asdict(draw), shown.content, shown.files])
         yield prepare_scene(folder.scene(draw), capture, draw, table.rules, depth, origin)
 
 

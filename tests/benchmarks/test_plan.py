@@ -1,9 +1,12 @@
 """A table's draws have a folder each, whatever their captures are called."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from captures import view_at
+from posed_folders import write_transforms
 
 from benchmarks.catalogue import Catalogue
 from benchmarks.protocol.captures import Capture
@@ -17,6 +20,7 @@ from extrap_train.config import (
     RulesConfig,
     TableConfig,
 )
+from extrap_train.data.scene_spec import open_scene
 from extrap_train.errors import InputError
 from extrap_train.views import stack_poses
 from tests.benchmarks.analytic import analytic_capture
@@ -46,6 +50,23 @@ def test_a_captures_name_leads_out_of_no_folder(tmp_path: Path) -> None:
     assert [scene.draw for scene in scenes] == draws
     assert (outside / "precious").exists()
     assert {path.name for path in tmp_path.iterdir()} == {"results", outside.name}
+
+
+def test_a_corrected_capture_is_prepared_again(tmp_path: Path) -> None:
+    """A table's folder may stay where the capture's cameras, depth or photographs change."""
+    write_transforms(tmp_path / "mug", [view_at(30 * i) for i in range(9)])
+    folder, file = TableFolder(tmp_path / "own"), tmp_path / "mug" / "transforms.json"
+
+    def prepare() -> bytes:
+        capture = Capture(replace(open_scene(str(file.parent)), category="apple"))
+        depth = DatasetDepthConfig()
+        (scene,) = prepare_draws(_TABLE, folder, [_draw(capture)], [capture], depth)
+        return (scene.folder / "inputs" / "depth.npy").read_bytes()
+
+    before = prepare()
+    assert prepare() == before
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"depth_unit_scale_factor": 0.002}))
+    assert prepare() != before
 
 
 def test_a_harmless_name_is_its_folder(tmp_path: Path) -> None:

@@ -279,7 +279,7 @@ def test_a_renamed_file_is_depth_of_another_photograph(tmp_path, monkeypatch):
     monkeypatch.setattr(plan, "prepare_scene", lambda *parts: parts[-1])
     np.save(tmp_path / "1.npy", np.ones((2, 2)))
     draw = Draw("apple", "one", 3, "random", 0, ("a",), ("b",))
-    capture = SimpleNamespace(sequence=SimpleNamespace(category="apple", name="one"))
+    capture = SimpleNamespace(sequence=SimpleNamespace(category="apple", name="one", frames=()))
     depth = FilesDepthConfig(folder=str(tmp_path), matcher=FlowMatcherConfig())
 
     def identities():
