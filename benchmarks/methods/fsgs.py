@@ -17,7 +17,6 @@ from extrap_train.gaussians.losses import pearson_depth_loss
 from extrap_train.gaussians.rasterize import Drawing
 from extrap_train.gaussians.recipe import Recipe, Training
 from extrap_train.gaussians.training_scene import TrainingScene
-from extrap_train.geometry.viewpoints import looking_at
 from extrap_train.views import Camera, View
 
 NEIGHBOURS = 3
@@ -179,12 +178,23 @@ def pseudo_camera(
     center = center + jitter * center.norm() * noise
     forward = (1 - share) * a.forward + share * b.forward
     down = (1 - share) * a.world_to_cam[1, :3] + share * b.world_to_cam[1, :3]
-    position, towards, upwards = (x.double().numpy(force=True) for x in (center, forward, -down))
-    world_to_cam = looking_at(position[None], position + towards, upwards)[0]
-    return replace(a, world_to_cam=torch.from_numpy(world_to_cam).to(center))
+    return replace(a, world_to_cam=_look_along(center, forward, down))
 
 
 def _on_arc(a: Float[Tensor, "3"], b: Float[Tensor, "3"], share: float) -> Float[Tensor, "3"]:
     straight = (1 - share) * a + share * b
     radius = (1 - share) * a.norm() + share * b.norm()
     return straight / straight.norm().clamp_min(1e-6) * radius
+
+
+def _look_along(
+    center: Float[Tensor, "3"], forward: Float[Tensor, "3"], down: Float[Tensor, "3"]
+) -> Float[Tensor, "4 4"]:
+    """world_to_cam of a camera at `center`; `down` need not be square to `forward`."""
+    z = forward / forward.norm()
+    x = torch.linalg.cross(down, z)
+    x = x / x.norm()
+    rotation = torch.stack([x, torch.linalg.cross(z, x), z])
+    world_to_cam = torch.eye(4).to(center)
+    world_to_cam[:3, :3], world_to_cam[:3, 3] = rotation, -rotation @ center
+    return world_to_cam

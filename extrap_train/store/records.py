@@ -48,23 +48,29 @@ def read_record(path: Path, kind: type[T], remedy: str) -> T:
     larger than `MAX_RECORD_BYTES`.
     """
     try:
-        with path.open("rb") as file:
-            content = file.read(MAX_RECORD_BYTES + 1)
+        too_large = path.stat().st_size > MAX_RECORD_BYTES
+        content = b"" if too_large else path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
+    if too_large:
+        raise _too_large(str(path), remedy)
     return parse_record(content, str(path), kind, remedy)
 
 
 def parse_record(content: bytes, where: str, kind: type[T], remedy: str) -> T:
     """The record in a file's content, as `read_record` reads it; errors say `where` it is."""
     if len(content) > MAX_RECORD_BYTES:
-        raise InputError(f"{where}: damaged (larger than such a file can be); {remedy}")
+        raise _too_large(where, remedy)
     try:
         return TypeAdapter(kind).validate_json(content, strict=True)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         entry = ".".join(map(str, first["loc"])) or "the file"
         raise InputError(f"{where}: damaged ({entry}: {first['msg']}); {remedy}") from None
+
+
+def _too_large(where: str, remedy: str) -> InputError:
+    return InputError(f"{where}: damaged (larger than such a file can be); {remedy}")
 
 
 def read_yaml(path: Path, remedy: str) -> dict[str, Any]:
