@@ -127,8 +127,12 @@ def plot_cameras(
         x, y, u, v, color=colour, label=label,
         angles="xy", scale_units="xy", scale=1, width=0.006,
     )  # fmt: skip
-    for number, place in enumerate(zip(x, y, strict=True), 1):
-        axes.annotate(str(number), place, color=colour)
+    for number, (right, up) in enumerate(zip(x, y, strict=True), 1):
+        outwards = np.array([right, up]) / max(np.hypot(right, up), 1e-9)
+        axes.annotate(
+            str(number), (right, up), 9 * outwards, textcoords="offset points",
+            color=colour, fontsize=8, ha="center", va="center",
+        )  # fmt: skip
     axes.plot(0, 0, "k+")
     axes.set_aspect("equal")
 

@@ -18,13 +18,17 @@ LINES = 10
 POINTS = 150
 TICKS = (0.1, 0.3, 1, 3, 10, 30, 100, 300)
 PROBLEMS, LONGEST = 4, 200
+TALLEST = 1.6
+"""Of the figure, against its usual height, where photographs are upright."""
 
 
 def draw_check(check: CaptureCheck, path: Path) -> None:
     """The worst, a middling and the best view with their neighbours; the cameras from above and
     from the side; every view's distances.
     """
-    figure = plt.figure(figsize=(16, 11), layout="constrained")
+    camera = check.views[0].camera
+    upright = min(max(camera.height / camera.width, 1), TALLEST)
+    figure = plt.figure(figsize=(16, 11 * upright), layout="constrained")
     grid = figure.add_gridspec(ROWS, 4, width_ratios=(1, 1, 1, 1.2))
     known = [m for m in check.matched if np.isfinite(m.distance)] or check.matched
     order = sorted(known, key=lambda m: -np.nan_to_num(m.distance))
@@ -34,6 +38,8 @@ def draw_check(check: CaptureCheck, path: Path) -> None:
     _draw_cameras(figure.add_subplot(grid[0, 3]), figure.add_subplot(grid[1, 3]), check)
     _draw_distances(figure.add_subplot(grid[2, 3]), check)
     said = check.problems[:PROBLEMS] or ["nothing looks wrong"]
+    if all(view.mask is None for view in check.views):
+        said = [*said, "no masks: the whole picture counts as the object's"]
     figure.suptitle("\n".join(map(_shorten, said)), fontsize=11)
     save_figure(figure, path, dpi=80)
 
