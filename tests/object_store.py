@@ -60,7 +60,10 @@ def serve_objects() -> Iterator[ObjectStore]:
             patch.setenv(name, value)
         thread.start()
         try:
-            fsspec.filesystem("s3").mkdir("bucket")
+            bucket = fsspec.filesystem("s3")
+            if bucket.exists("bucket"):  # moto keeps it for the next server of the same process
+                bucket.rm("bucket", recursive=True)
+            bucket.mkdir("bucket")
             yield store
         finally:
             server.shutdown()

@@ -12,10 +12,11 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from filelock import FileLock
 
@@ -28,7 +29,6 @@ from extrap_train.store.digests import file_digest
 from extrap_train.store.records import MAX_RECORD_BYTES, parse_record
 from extrap_train.terminal import track
 
-T = TypeVar("T")
 _MANIFEST, _SPLIT = "preparation.json", "split.json"
 _REMEDY = "write the shards again with data_prep shards="
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}")
@@ -79,33 +79,30 @@ class _Place:
 
     def read(self, name: str) -> bytes | None:
         """A small file's content, or None; what is larger than a record is cut."""
-
-        def load(store: Any, path: str) -> bytes | None:
+        with self._opened(name) as (store, path):
             try:
                 content: bytes = store.cat_file(path, start=0, end=MAX_RECORD_BYTES + 1)
             except FileNotFoundError:
                 return None
             return content
 
-        return self._try(name, load)
-
     def size(self, name: str) -> int | None:
         """A file's size in bytes, or None where it is not there."""
-
-        def look(store: Any, path: str) -> int | None:
+        with self._opened(name) as (store, path):
             try:
                 return int(store.info(path)["size"])
             except FileNotFoundError:
                 return None
 
-        return self._try(name, look)
+    def download(self, name: str, to: Path) -> None:
+        """Copy a file to the local disk."""
+        with self._opened(name) as (store, path):
+            # By itself, s3fs goes on where a read broke off; several at once, it gives up.
+            store.get_file(path, str(to), max_concurrency=1)
 
-    def get(self, name: str, to: Path) -> None:
-        # By itself, s3fs goes on where a read broke off; several at once, it gives up.
-        self._try(name, lambda store, path: store.get_file(path, str(to), max_concurrency=1))
-
-    def put(self, name: str, content: Path | bytes) -> None:
-        def send(store: Any, path: str) -> None:
+    def upload(self, content: Path | bytes, name: str) -> None:
+        """Write a file: a copy of a local one, or these bytes."""
+        with self._opened(name) as (store, path):
             if "file" in store.protocol:  # an object store has no folders: it would make a bucket
                 Path(path).parent.mkdir(parents=True, exist_ok=True)
             if isinstance(content, Path):
@@ -113,15 +110,16 @@ class _Place:
             else:
                 store.pipe_file(path, content)
 
-        self._try(name, send)
-
-    def _try(self, name: str, act: Callable[[Any, str], T]) -> T:
-        """What an action gives; the text of its error is left out, as it may hold credentials."""
+    @contextmanager
+    def _opened(self, name: str) -> Iterator[tuple[Any, str]]:
+        """The store and the file's path in it. InputError for what fails, without the error's text,
+        which may hold credentials.
+        """
         import fsspec
 
         try:
             store, root = fsspec.core.url_to_fs(self.url, use_listings_cache=False)
-            return act(store, f"{root.rstrip('/')}/{name}")
+            yield store, f"{root.rstrip('/')}/{name}"
         except ImportError as error:
             raise InputError(
                 f"shards={self.url}: {error}; for s3:// pip install 'extrap-train[s3]'"
@@ -137,7 +135,7 @@ class _Place:
 
 @dataclass(frozen=True)
 class _Fetcher:
-    """Lets files of the folder be there, from the shards of one category."""
+    """Fetches files of the folder, where they are missing, from the shards of one category."""
 
     place: _Place
     folder: Path
@@ -165,7 +163,7 @@ class _Fetcher:
         elif size != shard.size:
             problem = f"is damaged ({size} bytes instead of {shard.size})"
         else:
-            self.place.get(remote, to)
+            self.place.download(remote, to)
             if table_digest(to) == shard.sha256:
                 return
             problem = "is damaged (its SHA-256 is another)"
@@ -193,10 +191,10 @@ def write_shards(data: PreparedData, category: str, address: str) -> None:
     for name, file in track(files.items(), f"writing shards of {category}", len(files), "files"):
         remote = f"files/{shards[name].sha256}"
         if place.size(remote) != shards[name].size:
-            place.put(remote, file)
+            place.upload(file, remote)
             sent += 1
     if place.read(_MANIFEST) != manifest:
-        place.put(_MANIFEST, manifest)
+        place.upload(manifest, _MANIFEST)
     print(f"shards: {place.url} ({sent} files sent, {len(files) - sent} there before)")
 
 

@@ -48,12 +48,11 @@ def read_record(path: Path, kind: type[T], remedy: str) -> T:
     larger than `MAX_RECORD_BYTES`.
     """
     try:
-        too_large = path.stat().st_size > MAX_RECORD_BYTES
-        content = b"" if too_large else path.read_bytes()
+        if path.stat().st_size > MAX_RECORD_BYTES:
+            raise _too_large(str(path), remedy)
+        content = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
-    if too_large:
-        raise _too_large(str(path), remedy)
     return parse_record(content, str(path), kind, remedy)
 
 
